@@ -1,0 +1,58 @@
+"""How long work tells where it is, without printing by itself."""
+
+from __future__ import annotations
+
+import sys
+import time
+from typing import Protocol, TextIO
+
+
+class Progress(Protocol):
+    """Told by a stage: `step` how far it is, `value` a figure on the way."""
+
+    def step(self, done: int, total: int, note: str = "") -> None: ...
+
+    def value(self, name: str, value: float, *, at: int) -> None: ...
+
+
+class Silent:
+    """For tests and callers that do not look."""
+
+    def step(self, done: int, total: int, note: str = "") -> None:
+        pass
+
+    def value(self, name: str, value: float, *, at: int) -> None:
+        pass
+
+
+class Console:
+    """One line on stderr with an estimate, shown only when the work takes over two seconds."""
+
+    FIRST_SHOWN_S = 2.0
+
+    def __init__(self, label: str, stream: TextIO | None = None) -> None:
+        self._label = label
+        self._stream = stream if stream is not None else sys.stderr
+        self._every_s = 0.2 if self._stream.isatty() else 10.0
+        self._started_s = time.monotonic()
+        self._shown_s: float | None = None
+
+    def step(self, done: int, total: int, note: str = "") -> None:
+        now = time.monotonic()
+        elapsed = now - self._started_s
+        last = done >= total
+        due = self._shown_s is None or now - self._shown_s >= self._every_s or last
+        if elapsed < self.FIRST_SHOWN_S or not due:
+            return
+        self._shown_s = now
+        estimate = "" if last or done == 0 else f", about {elapsed / done * (total - done):.0f} s left"
+        text = f"{self._label}: {done}/{total} {note} ({elapsed:.0f} s{estimate})"
+        if self._stream.isatty():
+            text = f"\r\x1b[K{text}" + ("\n" if last else "")
+        else:
+            text += "\n"
+        self._stream.write(text)
+        self._stream.flush()
+
+    def value(self, name: str, value: float, *, at: int) -> None:
+        pass
