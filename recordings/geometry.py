@@ -35,7 +35,9 @@ class Transform:
             raise BadInput(f"{self} holds NaN or infinity; wanted finite numbers")
         off = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
         if off > ORTHONORMAL_TOLERANCE or np.linalg.det(rotation) < 0:
-            raise BadInput(f"{self}: not a rotation matrix (off by {off:.1e}, determinant {np.linalg.det(rotation):.3f})")
+            raise BadInput(
+                f"{self}: not a rotation matrix (off by {off:.1e}, determinant {np.linalg.det(rotation):.3f})"
+            )
         object.__setattr__(self, "rotation", rotation)
         object.__setattr__(self, "translation_m", translation_m)
 
@@ -202,7 +204,9 @@ class CameraModel:
     def __post_init__(self) -> None:
         wanted = COEFFICIENTS.get(self.distortion_model)
         if wanted is None:
-            raise BadInput(f"camera {self.frame}: unknown distortion model '{self.distortion_model}'; wanted {list(COEFFICIENTS)}")
+            raise BadInput(
+                f"camera {self.frame}: unknown distortion model '{self.distortion_model}'; wanted {list(COEFFICIENTS)}"
+            )
         if len(self.distortion) != wanted:
             raise BadInput(
                 f"camera {self.frame}: {self.distortion_model} takes {wanted} coefficients, found {len(self.distortion)}"
@@ -262,7 +266,9 @@ class CameraModel:
         pixels = np.asarray(pixels, dtype=np.float64)
         y = (pixels[..., 1] - self.cy) / self.fy
         x = (pixels[..., 0] - self.cx - self.K[0, 1] * y) / self.fx
-        ideal = _invert(self._distort, np.stack([x, y], -1)) if self.distortion_model != "none" else np.stack([x, y], -1)
+        ideal = (
+            _invert(self._distort, np.stack([x, y], -1)) if self.distortion_model != "none" else np.stack([x, y], -1)
+        )
         return np.concatenate([ideal, np.ones_like(ideal[..., :1])], -1)
 
     def back_project(self, pixels: Float[Array, "*n 2"], depth_m: Float[Array, "*n"]) -> Float[Array, "*n 3"]:

@@ -39,7 +39,9 @@ class ObjectTrack:
         lost = np.array([s == "lost" for s in self.status], dtype=bool)
         finite = np.isfinite(self.camera_from_object).all(axis=(1, 2))
         if len(self.status) != len(self.time_ns) or bool((lost & finite).any()) or bool((~lost & ~finite).any()):
-            raise BadInput(f"track of toss {self.toss}: status and poses disagree; a pose must be NaN exactly where it is lost")
+            raise BadInput(
+                f"track of toss {self.toss}: status and poses disagree; a pose must be NaN exactly where it is lost"
+            )
 
     @property
     def lost(self) -> Bool[Array, " n"]:
@@ -116,7 +118,9 @@ class RigCalibration:
         found = self.find(target, source)
         if found is None:
             known = sorted(str(t) for t in self.transforms)
-            raise BadInput(f"the calibration does not connect '{target}' and '{source}'; it has {known or 'no transforms'}")
+            raise BadInput(
+                f"the calibration does not connect '{target}' and '{source}'; it has {known or 'no transforms'}"
+            )
         return found
 
     def to_json(self) -> dict[str, Any]:
@@ -151,7 +155,9 @@ class RigCalibration:
                     TagPlacement(
                         int(t["id"]),
                         float(t["size_m"]),
-                        Transform.from_matrix("world", f"tag_{t['id']}", np.array(t["world_from_tag"], dtype=np.float64)),
+                        Transform.from_matrix(
+                            "world", f"tag_{t['id']}", np.array(t["world_from_tag"], dtype=np.float64)
+                        ),
                     )
                     for t in data.get("table_tags", [])
                 ),
@@ -160,7 +166,9 @@ class RigCalibration:
                 residuals=data.get("residuals", {}),
             )
         except (KeyError, TypeError, ValueError, AttributeError) as wrong:
-            raise BadInput(f"calibration: {type(wrong).__name__}: {wrong}; see ARCHITECTURE.md for the format") from wrong
+            raise BadInput(
+                f"calibration: {type(wrong).__name__}: {wrong}; see ARCHITECTURE.md for the format"
+            ) from wrong
 
     @staticmethod
     def read(path: Path) -> RigCalibration:
