@@ -208,9 +208,8 @@ class CameraModel:
                 f"camera {self.frame}: unknown distortion model '{self.distortion_model}'; wanted {list(COEFFICIENTS)}"
             )
         if len(self.distortion) != wanted:
-            raise BadInput(
-                f"camera {self.frame}: {self.distortion_model} takes {wanted} coefficients, found {len(self.distortion)}"
-            )
+            found = len(self.distortion)
+            raise BadInput(f"camera {self.frame}: {self.distortion_model} takes {wanted} coefficients, found {found}")
         object.__setattr__(self, "K", np.asarray(self.K, dtype=np.float64))
         object.__setattr__(self, "distortion", tuple(float(k) for k in self.distortion))
         for problem in self.problems():

@@ -97,7 +97,7 @@ class RigCalibration:
         return self.cameras[name]
 
     def find(self, target: str, source: str) -> Transform | None:
-        """`target_from_source`, chained over at most the stored transforms and their inverses; None if not connected."""
+        """`target_from_source`, chained over the stored transforms and their inverses; None if not connected."""
         edges: dict[str, list[Transform]] = {}
         for t in self.transforms:
             edges.setdefault(t.target, []).append(t)
