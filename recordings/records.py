@@ -156,7 +156,7 @@ class HealthLine:
 @dataclass(frozen=True, eq=False)
 class StampedPose:
     """A pose at a time: `matrix` maps points of frame `source` to frame `target`. `status` as in ObjectTrack;
-    a lost pose is NaN. `covariance`: 6x6 of (rotation vector in the target frame, rad; translation, m), None if unknown.
+    a lost pose is NaN. `covariance`: 6x6 of (rotation vector in the target frame, rad; translation, m), or None.
     """
 
     time_ns: int

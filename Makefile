@@ -1,0 +1,38 @@
+# `make demo` and `make test` on a fresh clone are enough: both make .venv first.
+PYTHON := $(shell for p in python3.11 python3.12; do $$p -c 'import venv, ensurepip' 2>/dev/null && echo $$p && break; done)
+BIN := .venv/bin
+STAMP := .venv/.installed
+OUT := out/demo
+SAMPLE := recordings/samples/box_toss
+EXTRAS := dev,sim,rig-realsense,rig-franka,rig-ur
+
+.PHONY: setup demo test test-all check bench
+
+setup: $(STAMP)
+
+$(STAMP): pyproject.toml constraints.txt
+	@test -n "$(PYTHON)" || { echo "no Python 3.11 or 3.12 with venv found; wanted: apt-get install -y python3.11-venv" >&2; exit 1; }
+	$(PYTHON) tools/check_system.py
+	test -x $(BIN)/python || $(PYTHON) -m venv .venv
+	# torch first and pinned: otherwise another package pulls the newest CUDA build, several gigabytes
+	$(BIN)/python -m pip install -q torch==2.13.0 -c constraints.txt
+	$(BIN)/python -m pip install -q -e ".[$(EXTRAS)]" -c constraints.txt
+	touch $(STAMP)
+
+demo: $(STAMP)
+	$(BIN)/toss-session info $(SAMPLE)
+	$(BIN)/toss-process $(SAMPLE) --out $(OUT)/results
+	$(BIN)/toss-view $(OUT)/results --screenshot $(OUT)/result.png
+	@echo "look at $(OUT)/result.png, read $(OUT)/results/table.md, open it: $(BIN)/toss-view $(OUT)/results"
+
+test: $(STAMP)
+	$(BIN)/python -m pytest -q -m "not slow and not gpu and not rig"
+
+test-all: $(STAMP)
+	$(BIN)/python -m pytest -q -m "not gpu and not rig"
+
+check: $(STAMP)
+	$(BIN)/python tools/check.py
+
+bench: $(STAMP)
+	for bench in tools/bench_*.py; do echo "== $$bench"; $(BIN)/python $$bench || exit 1; done
