@@ -183,6 +183,7 @@ def rotation_angle_rad(rotation: Float[Array, "3 3"]) -> float:
 DistortionModel = Literal["none", "brown-conrady", "rational", "fisheye"]
 COEFFICIENTS: dict[DistortionModel, int] = {"none": 0, "brown-conrady": 5, "rational": 8, "fisheye": 4}
 UNDISTORT_STEPS = 30
+UNDISTORT_TOLERANCE = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -261,7 +262,10 @@ class CameraModel:
         return self._pixels(self._distort(points_m[..., :2] / z))
 
     def rays(self, pixels: Float[Array, "*n 2"]) -> Float[Array, "*n 3"]:
-        """Directions (x, y, 1) in the optical frame through pixels: multiply by depth along the axis for points."""
+        """Directions (x, y, 1) in the optical frame through pixels: multiply by depth along the axis for points.
+
+        x and y are NaN for a pixel that no ray reaches through this lens (outside its distortion's valid range).
+        """
         pixels = np.asarray(pixels, dtype=np.float64)
         y = (pixels[..., 1] - self.cy) / self.fy
         x = (pixels[..., 0] - self.cx - self.K[0, 1] * y) / self.fx
@@ -320,18 +324,13 @@ def _distort_fisheye(xy: Float[Array, "*n 2"], k: tuple[float, ...]) -> Float[Ar
 def _invert(
     distort: Callable[[Float[Array, "*n 2"]], Float[Array, "*n 2"]], wanted: Float[Array, "*n 2"]
 ) -> Float[Array, "*n 2"]:
-    """Solve distort(xy) = wanted by damped Newton steps with a central-difference Jacobian."""
+    """Solve distort(xy) = wanted by damped Newton steps. NaN where there is no solution before the lens folds back."""
     xy = wanted.copy()
-    step = 1e-6
     for _ in range(UNDISTORT_STEPS):
         gap = wanted - distort(xy)
         if np.nanmax(np.abs(gap), initial=0.0) < 1e-13:
             break
-        dx = np.array([step, 0.0])
-        dy = np.array([0.0, step])
-        jx = (distort(xy + dx) - distort(xy - dx)) / (2 * step)
-        jy = (distort(xy + dy) - distort(xy - dy)) / (2 * step)
-        det = jx[..., 0] * jy[..., 1] - jx[..., 1] * jy[..., 0]
+        jx, jy, det = _jacobian(distort, xy)
         det = np.where(np.abs(det) < 1e-9, 1e-9, det)
         move = np.stack(
             [
@@ -342,4 +341,17 @@ def _invert(
         )
         length = np.linalg.norm(move, axis=-1, keepdims=True)
         xy = xy + move * np.minimum(1.0, 0.5 / np.maximum(length, 1e-12))
-    return xy
+    solved = np.abs(wanted - distort(xy)).max(axis=-1) < UNDISTORT_TOLERANCE
+    # a polynomial has more roots: past the fold the image is turned inside out (det < 0) or on the other side
+    upright = (_jacobian(distort, xy)[2] > 0) & ((xy * wanted).sum(axis=-1) > -UNDISTORT_TOLERANCE)
+    return np.where((solved & upright)[..., None], xy, np.nan)
+
+
+def _jacobian(
+    distort: Callable[[Float[Array, "*n 2"]], Float[Array, "*n 2"]], xy: Float[Array, "*n 2"], step: float = 1e-6
+) -> tuple[Float[Array, "*n 2"], Float[Array, "*n 2"], Float[Array, "*n"]]:
+    """Central differences of `distort` along x and along y, and their determinant."""
+    dx, dy = np.array([step, 0.0]), np.array([0.0, step])
+    jx = (distort(xy + dx) - distort(xy - dx)) / (2 * step)
+    jy = (distort(xy + dy) - distort(xy - dy)) / (2 * step)
+    return jx, jy, np.asarray(jx[..., 0] * jy[..., 1] - jx[..., 1] * jy[..., 0])

@@ -1,0 +1,318 @@
+"""Random access to an indexed MCAP file: any message by its place in its topic, without reading the whole file.
+
+Everything read is checked against the file's size and each chunk's CRC; whatever is wrong with the bytes comes out as
+`DamagedFile`, never as another exception.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import struct
+import zlib
+from collections import OrderedDict
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TypeVar
+
+import lz4.frame
+import numpy as np
+import zstandard
+from jaxtyping import Int64
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import Attachment, AttachmentIndex, Channel, ChunkIndex, Metadata, MetadataIndex, Schema, Statistics
+from mcap.stream_reader import StreamReader
+from mcap.summary import Summary
+from numpy import ndarray as Array
+
+from recordings.errors import BadInput, DamagedFile
+from recordings.mcap_writer import MAGIC
+
+CACHED_CHUNKS = 4
+MAX_CHUNK_BYTES = 1 << 30
+_MESSAGE_HEAD = struct.Struct("<BQHIQQ")
+_CHUNK_HEAD = struct.Struct("<BQQQQI")
+_RAISED = (McapError, ValueError, KeyError, IndexError, struct.error, EOFError, OverflowError, MemoryError, OSError)
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Message:
+    """One message, not decoded. `log_time_ns`: when the host received it; `publish_time_ns`: mid-exposure."""
+
+    topic: str
+    sequence: int
+    log_time_ns: int
+    publish_time_ns: int
+    data: bytes
+
+
+class McapFile:
+    """An MCAP file with an index. Raises BadInput when it is none, DamagedFile when it was cut off or altered."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        try:
+            self._file = open(path, "rb", buffering=0)  # noqa: SIM115
+            self.size = os.fstat(self._file.fileno()).st_size
+        except IsADirectoryError as folder:
+            raise BadInput(f"{path} is a folder; wanted an .mcap file") from folder
+        except OSError as refused:
+            raise BadInput(f"{path} cannot be opened: {refused.strerror}") from refused
+        self._check_ends()
+        self.summary: Summary = self._guard(self._read_summary, "its index")
+        self._cache: OrderedDict[int, bytes] = OrderedDict()
+
+    def __enter__(self) -> McapFile:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        self._file.close()
+
+    @cached_property
+    def channels(self) -> dict[str, Channel]:
+        """Channels by topic. Two channels of one topic are refused: tosslab writes one."""
+        found: dict[str, Channel] = {}
+        for channel in self.summary.channels.values():
+            if channel.topic in found and self.count(channel.id) == 0:
+                continue
+            found[channel.topic] = channel
+        return found
+
+    def schema(self, topic: str) -> Schema | None:
+        return self.summary.schemas.get(self.channels[topic].schema_id)
+
+    def count(self, channel_id: int) -> int:
+        statistics = self.summary.statistics
+        return int(statistics.channel_message_counts.get(channel_id, 0)) if statistics else 0
+
+    def topic_index(self, topic: str) -> TopicIndex:
+        """Where every message of a topic lies, in the order of log time. Empty for a topic that is not there."""
+        if topic not in self.channels:
+            return TopicIndex.empty()
+        if topic not in self._indexes:
+            self._indexes[topic] = self._guard(lambda: self._read_index(self.channels[topic].id), f"the index of {topic}")
+        return self._indexes[topic]
+
+    def read(self, topic: str, position: int) -> Message:
+        """The message at a position (0-based, log-time order) of a topic."""
+        index = self.topic_index(topic)
+        chunk = self._chunk(int(index.chunk[position]))
+        offset = int(index.offset[position])
+        return self._guard(lambda: self._cut(topic, chunk, offset), f"message {position} of {topic}")
+
+    def messages(self, topic: str) -> Iterator[Message]:
+        for position in range(len(self.topic_index(topic))):
+            yield self.read(topic, position)
+
+    def publish_times_ns(self, topic: str) -> Int64[Array, " n"]:
+        """Publish time of every message of a topic; of uncompressed chunks only the message heads are read."""
+        index = self.topic_index(topic)
+        times = np.empty(len(index), dtype=np.int64)
+        for i in range(len(index)):
+            head = self._guard(lambda i=i: self._head(int(index.chunk[i]), int(index.offset[i])), f"message {i} of {topic}")
+            times[i] = head[5]
+        return times
+
+    def metadata(self, name: str) -> list[dict[str, str]]:
+        """Every metadata record of that name."""
+        places = [m.offset for m in self.summary.metadata_indexes if m.name == name]
+        return [self._guard(lambda o=o: self._record(o, Metadata), f"metadata {name}").metadata for o in places]
+
+    def attachments(self) -> list[str]:
+        return [a.name for a in self.summary.attachment_indexes]
+
+    def attachment(self, name: str) -> bytes | None:
+        """The last attachment of that name; None if there is none."""
+        places = [a.offset for a in self.summary.attachment_indexes if a.name == name]
+        if not places:
+            return None
+        record = self._guard(lambda: self._record(places[-1], Attachment), f"attachment {name}")
+        return bytes(record.data)
+
+    def _check_ends(self) -> None:
+        start, end = self._pread(0, 8), self._pread(max(0, self.size - 8), 8)
+        if self.size == 0:
+            raise BadInput(f"{self.path} is empty (0 bytes); wanted an MCAP file")
+        if start[: len(MAGIC)] != MAGIC[: len(start)] or self.size < 8:
+            raise BadInput(f"{self.path} is not an MCAP file: it begins with {start[:8]!r}")
+        if end != MAGIC or self.size < 8 + 29 + 8:
+            raise DamagedFile(
+                f"{self.path} was cut off: it has no MCAP end mark. Its complete chunks can be saved: "
+                f"`toss-session recover {self.path} NEW.mcap`"
+            )
+
+    @cached_property
+    def _indexes(self) -> dict[str, TopicIndex]:
+        return {}
+
+    def _guard(self, read: Callable[[], T], what: str) -> T:
+        try:
+            return read()
+        except BadInput:
+            raise
+        except _RAISED as wrong:
+            raise DamagedFile(
+                f"{self.path}: {what} is damaged ({type(wrong).__name__}: {str(wrong)[:120]}). What can be read can be "
+                f"saved: `toss-session recover {self.path} NEW.mcap`"
+            ) from wrong
+
+    def _pread(self, offset: int, length: int) -> bytes:
+        return os.pread(self._file.fileno(), length, offset)
+
+    def _exactly(self, offset: int, length: int) -> bytes:
+        if offset < 0 or length < 0 or offset + length > self.size:
+            raise ValueError(f"{length} bytes at {offset} of {self.size}")
+        data = self._pread(offset, length)
+        if len(data) != length:
+            raise ValueError(f"{len(data)} of {length} bytes at {offset}")
+        return data
+
+    def _read_summary(self) -> Summary:
+        footer = self._exactly(self.size - 37, 29)
+        opcode, length, start, offsets_start, crc = struct.unpack("<BQQQI", footer)
+        if opcode != Opcode.FOOTER or length != 20:
+            raise ValueError("no footer")
+        if start == 0:
+            raise ValueError("no summary")
+        block = self._exactly(start, self.size - 37 - start)
+        if crc and zlib.crc32(footer[:25], zlib.crc32(block)) != crc:
+            raise ValueError("the summary's CRC differs")
+        summary = _parse_summary(block + footer + MAGIC)
+        for channel in summary.channels.values():
+            if channel.schema_id and channel.schema_id not in summary.schemas:
+                raise ValueError(f"topic {channel.topic} names a schema that is not there")
+        return summary
+
+    def _read_index(self, channel: int) -> TopicIndex:
+        times, chunks, offsets = [], [], []
+        for number, chunk in enumerate(self.summary.chunk_indexes):
+            place = chunk.message_index_offsets.get(channel)
+            if place is None:
+                continue
+            opcode, length, _, size = struct.unpack("<BQHI", self._exactly(place, 15))
+            if opcode != Opcode.MESSAGE_INDEX or size != length - 6 or size % 16:
+                raise ValueError("a message index record is malformed")
+            table = np.frombuffer(self._exactly(place + 15, size), dtype="<u8").reshape(-1, 2)
+            times.append(table[:, 0].astype(np.int64))
+            offsets.append(table[:, 1].astype(np.int64))
+            chunks.append(np.full(len(table), number, dtype=np.int64))
+        if not times:
+            return TopicIndex.empty()
+        joined = np.concatenate(times)
+        order = np.argsort(joined, kind="stable")
+        return TopicIndex(joined[order], np.concatenate(chunks)[order], np.concatenate(offsets)[order])
+
+    def _record(self, offset: int, kind: type[T]) -> T:
+        length = struct.unpack("<Q", self._exactly(offset + 1, 8))[0]
+        data = self._exactly(offset, 9 + length)
+        for record in StreamReader(io.BytesIO(data), skip_magic=True, validate_crcs=True).records:
+            if isinstance(record, kind):
+                return record
+            break
+        raise ValueError(f"no {kind.__name__} at {offset}")
+
+    def _chunk_place(self, number: int) -> tuple[ChunkIndex, int]:
+        chunk = self.summary.chunk_indexes[number]
+        return chunk, chunk.chunk_start_offset + _CHUNK_HEAD.size + 4 + len(chunk.compression.encode()) + 8
+
+    def _chunk(self, number: int) -> bytes:
+        if number in self._cache:
+            self._cache.move_to_end(number)
+            return self._cache[number]
+        data = self._guard(lambda: self._load_chunk(number), f"chunk {number}")
+        self._cache[number] = data
+        while len(self._cache) > CACHED_CHUNKS:
+            self._cache.popitem(last=False)
+        return data
+
+    def _load_chunk(self, number: int) -> bytes:
+        chunk, place = self._chunk_place(number)
+        head = self._exactly(chunk.chunk_start_offset, place - chunk.chunk_start_offset)
+        opcode, _, _, _, size, crc = _CHUNK_HEAD.unpack(head[: _CHUNK_HEAD.size])
+        if opcode != Opcode.CHUNK or size != chunk.uncompressed_size or size > MAX_CHUNK_BYTES:
+            raise ValueError("the chunk's head and its index disagree")
+        data = decompress(chunk.compression, self._exactly(place, chunk.compressed_size), size)
+        if crc and zlib.crc32(data) != crc:
+            raise ValueError("the chunk's CRC differs")
+        return data
+
+    def _head(self, number: int, offset: int) -> tuple[int, ...]:
+        chunk, place = self._chunk_place(number)
+        if chunk.compression:
+            return _MESSAGE_HEAD.unpack_from(self._chunk(number), offset)
+        if offset + _MESSAGE_HEAD.size > chunk.uncompressed_size:
+            raise ValueError("a message lies outside its chunk")
+        return _MESSAGE_HEAD.unpack(self._exactly(place + offset, _MESSAGE_HEAD.size))
+
+    def _cut(self, topic: str, chunk: bytes, offset: int) -> Message:
+        opcode, length, channel, sequence, log_ns, publish_ns = _MESSAGE_HEAD.unpack_from(chunk, offset)
+        end = offset + 9 + length
+        if opcode != Opcode.MESSAGE or channel != self.channels[topic].id or end > len(chunk) or length < 22:
+            raise ValueError("its index points to something else")
+        return Message(topic, sequence, log_ns, publish_ns, chunk[offset + _MESSAGE_HEAD.size : end])
+
+
+@dataclass(frozen=True, eq=False)
+class TopicIndex:
+    """Log time, chunk number and offset within the uncompressed chunk of each message, in log-time order."""
+
+    log_time_ns: Int64[Array, " n"]
+    chunk: Int64[Array, " n"]
+    offset: Int64[Array, " n"]
+
+    def __len__(self) -> int:
+        return len(self.log_time_ns)
+
+    @staticmethod
+    def empty() -> TopicIndex:
+        none = np.zeros(0, dtype=np.int64)
+        return TopicIndex(none, none, none)
+
+
+def _parse_summary(block: bytes) -> Summary:
+    summary = Summary()
+    for record in StreamReader(io.BytesIO(block), skip_magic=True, record_size_limit=len(block)).records:
+        if isinstance(record, Schema):
+            summary.schemas[record.id] = record
+        elif isinstance(record, Channel):
+            summary.channels[record.id] = record
+        elif isinstance(record, Statistics):
+            summary.statistics = record
+        elif isinstance(record, ChunkIndex):
+            summary.chunk_indexes.append(record)
+        elif isinstance(record, AttachmentIndex):
+            summary.attachment_indexes.append(record)
+        elif isinstance(record, MetadataIndex):
+            summary.metadata_indexes.append(record)
+    if summary.statistics is None:
+        raise ValueError("no statistics")
+    return summary
+
+
+def decompress(compression: str, data: bytes, size: int) -> bytes:
+    """The raw bytes of a chunk. Raises ValueError when they are not `size` bytes or the compression is unknown."""
+    if size > MAX_CHUNK_BYTES:
+        raise ValueError(f"a chunk of {size} bytes")
+    try:
+        if compression == "":
+            raw = data
+        elif compression == "zstd":
+            if zstandard.frame_content_size(data) not in (-1, size):
+                raise ValueError("the chunk's head and its content disagree in size")
+            raw = zstandard.ZstdDecompressor().decompress(data, max_output_size=size)
+        elif compression == "lz4":
+            raw = lz4.frame.decompress(data)
+        else:
+            raise ValueError(f"chunk compression '{compression}' is not known; wanted none, lz4 or zstd")
+    except (zstandard.ZstdError, RuntimeError) as wrong:
+        raise ValueError(f"{compression} data cannot be decompressed: {wrong}") from wrong
+    if len(raw) != size:
+        raise ValueError(f"a chunk gave {len(raw)} bytes, its head says {size}")
+    return raw

@@ -1,0 +1,302 @@
+"""Writing a session: one complete MCAP file per toss, a start and a stop document, sha256 of every file."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
+from jaxtyping import Bool
+from numpy import ndarray as Array
+
+from recordings import codec
+from recordings.errors import BadInput, WriteFailed
+from recordings.geometry import Transform
+from recordings.mcap_writer import McapWriter
+from recordings.records import ArmStates, DepthImage, EncodedImage, HealthLine, StampedPose, TossCommand, TossEvent
+from recordings.tracks import RigCalibration
+
+FORMAT_VERSION = 1
+NO_CALIBRATION = RigCalibration(cameras={})
+
+
+def toss_name(toss: int) -> str:
+    return f"toss_{toss:02d}"
+
+
+class TossWriter:
+    """One file of a session, complete in itself. As a context: finished on a clean exit, left recoverable otherwise."""
+
+    def __init__(
+        self, path: Path, start: Mapping[str, Any], calibration: RigCalibration, kind: str, info: Mapping[str, Any]
+    ) -> None:
+        self.path = path
+        self.sha256: str | None = None
+        self._calibration = calibration
+        self._writer = McapWriter(path)
+        self._channels: dict[str, tuple[int, type]] = {}
+        self._schemas: dict[type, int] = {}
+        self._sizes: dict[str, tuple[int, int]] = {}
+        self._dropped: dict[str, int] = {}
+        self._begun = False
+        self._writer.metadata(
+            "tosslab", {"format_version": str(FORMAT_VERSION), "kind": kind, "info": json.dumps(dict(info))}
+        )
+        self._writer.attachment("session.json", "application/json", _json_bytes({"format_version": FORMAT_VERSION, "start": start}))
+        self._writer.attachment("calibration.json", "application/json", _json_bytes(calibration.to_json()))
+
+    def __enter__(self) -> TossWriter:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *exc: object) -> None:
+        if kind is None and self.sha256 is None:
+            self.finish()
+        else:
+            self._writer.abandon()
+
+    def color(self, image: EncodedImage) -> None:
+        self._image(f"/{image.camera}/color", image)
+
+    def mono(self, image: EncodedImage) -> None:
+        self._image(f"/{image.camera}/image", image)
+
+    def depth(self, image: DepthImage) -> None:
+        if image.raw.dtype != np.uint16 or not 0 < image.unit_m < 1:
+            raise BadInput(f"{image.camera} depth {image.index}: wanted uint16 with a unit in metres, found {image.raw.dtype}, {image.unit_m}")
+        topic = f"/{image.camera}/depth"
+        height, width = image.raw.shape
+        self._same_size(topic, width, height)
+        payload = codec.encode_depth(image)
+        self._put(topic, payload, image.host_time_ns, image.time_ns, image.index, {"unit_m": repr(image.unit_m)})
+
+    def arm(self, states: ArmStates) -> None:
+        for i, time_ns in enumerate(states.time_ns):
+            self._put("/arm/joint_states", codec.encode_arm(states, i), int(time_ns), int(time_ns), i)
+
+    def command(self, command: TossCommand) -> None:
+        self._put("/toss/command", codec.encode_command(command), command.time_ns, command.time_ns, 0)
+
+    def event(self, event: TossEvent) -> None:
+        self._put("/toss/event", codec.encode_event(event), event.time_ns, event.time_ns, 0)
+
+    def health(self, line: HealthLine) -> None:
+        self._put("/health", codec.encode_health(line), line.time_ns, line.time_ns, 0)
+
+    def pose(self, topic: str, pose: StampedPose, index: int = 0) -> None:
+        """A pose on `topic`, its status and covariance on `<topic>_quality`."""
+        self._put(topic, codec.encode_pose(pose), pose.time_ns, pose.time_ns, index)
+        self._put(f"{topic}_quality", codec.encode_pose_quality(pose), pose.time_ns, pose.time_ns, index)
+
+    def mask(self, position: int, mask: Bool[Array, "h w"]) -> None:
+        """A given mask of the object in the colour frame at `position` of this toss (0 is the first)."""
+        self._writer.attachment(f"masks/{position:06d}.png", "image/png", codec.encode_mask(mask))
+
+    def dropped(self, topic: str, count: int = 1) -> None:
+        """Count messages that arrived and could not be kept."""
+        self._dropped[topic] = self._dropped.get(topic, 0) + count
+
+    def streams(self) -> dict[str, dict[str, int]]:
+        """Received, written and dropped by topic, for the stop document."""
+        written = self._writer.counts
+        return {
+            topic: {
+                "received": written.get(topic, 0) + self._dropped.get(topic, 0),
+                "written": written.get(topic, 0),
+                "dropped": self._dropped.get(topic, 0),
+            }
+            for topic in sorted({*written, *self._dropped})
+        }
+
+    def finish(self) -> str:
+        """Write counts and index, close, return the file's sha256."""
+        self._begin(0)
+        self._writer.metadata("tosslab.stop", {"status": "complete", "streams": json.dumps(self.streams())})
+        self.sha256 = self._writer.finish()
+        return self.sha256
+
+    def _image(self, topic: str, image: EncodedImage) -> None:
+        self._same_size(topic, image.width, image.height)
+        size = {"width": str(image.width), "height": str(image.height)}
+        self._put(topic, codec.encode_image(image), image.host_time_ns, image.time_ns, image.index, size)
+
+    def _same_size(self, topic: str, width: int, height: int) -> None:
+        first = self._sizes.setdefault(topic, (width, height))
+        if first != (width, height):
+            raise BadInput(f"{topic}: an image of {width}x{height} after images of {first[0]}x{first[1]}; one size per toss")
+
+    def _put(
+        self,
+        topic: str,
+        payload: codec.Payload,
+        host_ns: int,
+        time_ns: int,
+        index: int,
+        metadata: Mapping[str, str] | None = None,
+    ) -> None:
+        self._begin(host_ns)
+        channel = self._channel(topic, payload.schema, metadata)
+        self._writer.message(channel, host_ns, time_ns, index, payload.data, compress=payload.compress)
+
+    def _channel(self, topic: str, schema: Any, metadata: Mapping[str, str] | None) -> int:
+        if topic not in self._channels:
+            if schema not in self._schemas:
+                name = schema.DESCRIPTOR.full_name
+                self._schemas[schema] = self._writer.schema(name, "protobuf", codec.schema_descriptor(schema))
+            self._channels[topic] = (self._writer.channel(topic, "protobuf", self._schemas[schema], metadata), schema)
+        number, first = self._channels[topic]
+        if first is not schema:
+            raise BadInput(f"{topic}: {schema.DESCRIPTOR.full_name} after {first.DESCRIPTOR.full_name}; one encoding per toss")  # type: ignore[attr-defined]
+        return number
+
+    def _begin(self, time_ns: int) -> None:
+        """Camera models and static transforms go first, at the time of the first message."""
+        if self._begun:
+            return
+        self._begun = True
+        transforms = list(self._calibration.transforms)
+        for name, camera in self._calibration.cameras.items():
+            topic = f"/{name[: -len('_depth')]}/depth_calibration" if name.endswith("_depth") else f"/{name}/calibration"
+            self._send(topic, CameraCalibration, codec.encode_calibration(camera, time_ns), time_ns)
+        if "d455" in self._calibration.cameras and "d455_depth" not in self._calibration.cameras:
+            transforms.append(Transform.identity("d455", "d455_depth"))
+        if transforms:
+            payload = codec.encode_transforms(tuple(transforms), time_ns)
+            self._send("/tf", payload.schema, payload, time_ns)
+
+    def _send(self, topic: str, schema: Any, payload: codec.Payload, time_ns: int) -> None:
+        self._writer.message(self._channel(topic, schema, None), time_ns, time_ns, 0, payload.data)
+
+
+class SessionWriter:
+    """A session folder being written. The folder must not exist, or be empty. Leaving the context without `finish`
+    writes a stop document with status `failed` or `interrupted`; every finished toss stays whole."""
+
+    def __init__(self, folder: Path, start: Mapping[str, Any], calibration: RigCalibration = NO_CALIBRATION) -> None:
+        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+            raise BadInput(f"{folder} exists already; nothing was written. Choose another name or remove it")
+        self.folder = folder
+        self.start = {"created_unix_ns": time.time_ns(), **start}
+        self._calibration = calibration
+        self._tosses: dict[str, TossWriter] = {}
+        self._info: dict[str, Mapping[str, Any]] = {}
+        self._stopped = False
+        _make_folder(folder)
+        write_json(folder / "calibration.json", calibration.to_json())
+        self._write_document(None)
+
+    def __enter__(self) -> SessionWriter:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, *rest: object) -> None:
+        if self._stopped:
+            return
+        interrupted = kind is None or issubclass(kind, KeyboardInterrupt)
+        try:
+            self.finish("interrupted" if interrupted else "failed", str(error) if error else "left without finish")
+        except WriteFailed:
+            if kind is None:
+                raise
+
+    def toss(self, toss: int, info: Mapping[str, Any] | None = None) -> TossWriter:
+        """A new toss's file. `info` (JSON values) is kept in it and in session.json, for instance clock offsets."""
+        return self._file(toss_name(toss), "toss", {"toss": toss, **(info or {})})
+
+    def calibration_views(self) -> TossWriter:
+        """calibration.mcap: views of a board, one image of each camera per view, stamped one second apart."""
+        return self._file("calibration", "calibration", {})
+
+    def finish(self, status: str = "complete", reason: str = "") -> None:
+        """Write the stop document: counts per stream and the sha256 of every finished file."""
+        sha256 = {t.path.name: t.sha256 for t in self._tosses.values() if t.sha256 is not None}
+        sha256["calibration.json"] = file_sha256(self.folder / "calibration.json")
+        self._write_document(
+            {
+                "stopped_unix_ns": time.time_ns(),
+                "status": status,
+                "reason": reason,
+                "streams": {name: t.streams() for name, t in self._tosses.items()},
+                "tosses": {name: dict(info) for name, info in self._info.items()},
+                "sha256": sha256,
+            }
+        )
+        self._stopped = True
+
+    def _file(self, name: str, kind: str, info: Mapping[str, Any]) -> TossWriter:
+        if name in self._tosses:
+            raise BadInput(f"{name} was written already in this session; nothing was changed")
+        writer = TossWriter(self.folder / f"{name}.mcap", self.start, self._calibration, kind, info)
+        self._tosses[name], self._info[name] = writer, info
+        return writer
+
+    def _write_document(self, stop: Mapping[str, Any] | None) -> None:
+        write_json(
+            self.folder / "session.json", {"format_version": FORMAT_VERSION, "start": self.start, "stop": stop}
+        )
+
+
+def write_truth(
+    session: Path,
+    poses: Mapping[int, Sequence[StampedPose]],
+    info: Mapping[str, Any],
+    mesh_obj: bytes | None = None,
+) -> Path:
+    """Write the session's truth/ folder: a file of `/groundtruth/pose` per toss, truth.json and mesh.obj.
+
+    `poses` are `world_from_object` or `d455_from_object`, as each names itself. The folder must not exist yet.
+    """
+    folder = session / "truth"
+    if folder.exists():
+        raise BadInput(f"{folder} exists already; nothing was written. Remove it to write the truth anew")
+    _make_folder(folder)
+    sha256 = {}
+    for toss, track in poses.items():
+        with TossWriter(folder / f"{toss_name(toss)}.mcap", {"truth": dict(info)}, NO_CALIBRATION, "truth", {"toss": toss}) as w:
+            for i, pose in enumerate(track):
+                w.pose("/groundtruth/pose", pose, i)
+            sha256[w.path.name] = w.finish()
+    if mesh_obj is not None:
+        write_bytes(folder / "mesh.obj", mesh_obj)
+        sha256["mesh.obj"] = file_sha256(folder / "mesh.obj")
+    write_json(folder / "truth.json", {"format_version": FORMAT_VERSION, **info, "sha256": sha256})
+    return folder
+
+
+def write_json(path: Path, document: Mapping[str, Any]) -> None:
+    """Whole or not at all: written beside, synced, renamed."""
+    write_bytes(path, _json_bytes(document))
+
+
+def write_bytes(path: Path, data: bytes) -> None:
+    """Whole or not at all: written beside, synced, renamed. Raises WriteFailed."""
+    partial = path.with_name(path.name + ".partial")
+    try:
+        with open(partial, "wb") as out:
+            out.write(data)
+            out.flush()
+            os.fsync(out.fileno())
+        partial.replace(path)
+    except OSError as refused:
+        raise WriteFailed(f"{path} could not be written: {refused.strerror}; nothing was changed there") from refused
+
+
+def file_sha256(path: Path) -> str:
+    import hashlib
+
+    with open(path, "rb") as data:
+        return hashlib.file_digest(data, "sha256").hexdigest()
+
+
+def _json_bytes(document: Mapping[str, Any]) -> bytes:
+    return (json.dumps(document, indent=1) + "\n").encode()
+
+
+def _make_folder(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as refused:
+        raise WriteFailed(f"{folder} cannot be made: {refused.strerror}") from refused
