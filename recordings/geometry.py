@@ -107,7 +107,7 @@ def nearest_rotation(matrix: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
     off = float(np.abs(rotation - matrix).max())
     if off > 1e-3:
         raise BadInput(f"not a rotation matrix: off by {off:.2g}; wanted orthonormal columns and determinant +1")
-    return rotation
+    return rotation if off > 1e-12 else matrix.copy()  # what is exact comes back from a file to the last bit
 
 
 def rotation_from_quaternion(quaternion_wxyz: Float[Array, "4"]) -> Float[Array, "3 3"]:
@@ -221,6 +221,8 @@ class CameraModel:
         found = []
         if self.width < 1 or self.height < 1:
             return [f"image size {self.width}x{self.height}; wanted at least 1x1"]
+        if self.K.shape != (3, 3):
+            return [f"a camera matrix of shape {self.K.shape}; wanted 3x3"]
         if not np.isfinite(self.K).all() or not np.isfinite(self.distortion).all():
             return ["NaN or infinity in the intrinsics; wanted finite numbers"]
         if min(self.fx, self.fy) <= 0:

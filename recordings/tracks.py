@@ -173,9 +173,12 @@ class RigCalibration:
     @staticmethod
     def read(path: Path) -> RigCalibration:
         try:
-            return RigCalibration.from_json(json.loads(path.read_text()))
+            data = json.loads(path.read_text())
         except (OSError, json.JSONDecodeError, UnicodeDecodeError) as wrong:
             raise BadInput(f"{path}: cannot be read as a calibration ({wrong})") from wrong
+        if not isinstance(data, dict):
+            raise BadInput(f"{path}: cannot be read as a calibration (wanted a JSON object, found {str(data)[:40]})")
+        return RigCalibration.from_json(data)
 
 
 def _camera_to_json(camera: CameraModel) -> dict[str, Any]:

@@ -1,0 +1,47 @@
+"""What every test may ask for: the shared data (or a skip that says why it is not there), the shipped sample."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+from hypothesis import settings
+
+if TYPE_CHECKING:
+    from recordings.session import Session
+
+ROOT = Path(__file__).resolve().parent.parent
+DATA = Path(os.environ.get("TOSSLAB_DATA", ROOT.parent / "shared" / "data"))
+
+# No deadlines: the machine is shared. In CI the same examples every time.
+settings.register_profile("tosslab", deadline=None, derandomize="CI" in os.environ)
+settings.load_profile("tosslab")
+
+
+@pytest.fixture(scope="session")
+def data() -> Callable[[str], Path]:
+    """`data("cube_dev")` is that folder of the shared data; the test is skipped where it is absent."""
+
+    def find(name: str) -> Path:
+        path = DATA / name
+        if not path.exists():
+            pytest.skip(f"no {path}: set TOSSLAB_DATA to the folder that holds {name.split('/')[0]}")
+        return path
+
+    return find
+
+
+@pytest.fixture(scope="session")
+def sample_path() -> Path:
+    """The session that the repository ships."""
+    return ROOT / "recordings" / "samples" / "box_toss"
+
+
+@pytest.fixture
+def sample_session(sample_path: Path) -> Session:
+    from recordings.session import Session
+
+    return Session.open(sample_path)

@@ -1,0 +1,112 @@
+"""What holds for the house as a whole: quick and light --help, pinned packages, laws that no tool knows."""
+
+import importlib.util
+import json
+import re
+import resource
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+COMMANDS = PROJECT["scripts"]
+HEAVY = ("open3d", "torch", "rerun", "mujoco", "numba", "rosbags", "pyrealsense2", "pinocchio", "pydrake", "pybullet",
+         "gtsam", "matplotlib", "trimesh", "skimage", "pyarrow", "pupil_apriltags")  # fmt: skip
+HELP_CPU_S = 0.5
+
+# Runs a command as its console script would, then says on the last line what it had imported.
+ASK = """
+import json, sys
+sys.argv = {argv!r}
+code = None
+try:
+    from {module} import {function} as main
+    code = main()
+except SystemExit as leaving:
+    code = leaving.code
+print()
+print(json.dumps([code or 0, sorted({{name.partition(".")[0] for name in sys.modules}})]))
+"""
+
+
+def ask(command, *arguments):
+    """Exit code, text, top-level modules imported, CPU seconds of one call in a fresh interpreter."""
+    module, function = COMMANDS[command].split(":")
+    program = ASK.format(argv=[command, *arguments], module=module, function=function)
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, cwd=ROOT)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    assert done.returncode == 0, done.stderr
+    *text, last = done.stdout.splitlines()
+    code, modules = json.loads(last)
+    cpu_s = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    return code, "\n".join(text), set(modules), cpu_s
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_shows_an_example_and_imports_nothing_heavy(command):
+    code, text, modules, _ = ask(command, "--help")
+    assert code == 0
+    assert f"usage: {command}" in text
+    assert re.search(rf"^\s*{command} \S", text, re.M), "no copyable example"
+    assert modules.isdisjoint(HEAVY), f"--help imports {sorted(modules.intersection(HEAVY))}"
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_answers_in_under_half_a_second(command):
+    # the quickest of three: what other programs do meanwhile is not ours
+    assert min(ask(command, "--help")[3] for _ in range(3)) < HELP_CPU_S
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_an_unknown_argument_is_usage_and_exit_code_2(command):
+    assert ask(command, "--no-such-thing")[0] == 2
+
+
+def test_constraints_pin_names_and_versions_and_nothing_else():
+    lines = (ROOT / "constraints.txt").read_text().splitlines()
+    wrong = [line for line in lines if not re.fullmatch(r"[A-Za-z0-9._-]+==[0-9][0-9A-Za-z.]*", line)]
+    assert not wrong
+    assert "torch==2.13.0" in lines
+
+
+def test_every_package_that_the_project_asks_for_is_pinned():
+    def plain(name):
+        return re.sub(r"[-_.]+", "-", re.match(r"[A-Za-z0-9._-]+", name).group()).lower()
+
+    asked = [*PROJECT["dependencies"], *(n for extra in PROJECT["optional-dependencies"].values() for n in extra)]
+    pinned = {plain(line) for line in (ROOT / "constraints.txt").read_text().splitlines()}
+    assert {plain(name) for name in asked} <= pinned
+
+
+@pytest.fixture
+def check():
+    """tools/check.py, which nothing imports otherwise."""
+    spec = importlib.util.spec_from_file_location("tools_check", ROOT / "tools" / "check.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.parametrize(
+    "line", ["DATA = '/" + "work/shared'", "open('/" + "tmp/x')", "see files.python" + "hosted.org"]
+)
+def test_names_of_machines_are_found(check, line):
+    assert len(list(check.hidden_machines("a.py", f"x = 1\n{line}\n"))) == 1
+
+
+@pytest.mark.parametrize("line", ["results/work/a", "https://example.org/tmp/", "out/" + "tmp/x", "/d455/color"])
+def test_other_paths_are_left_alone(check, line):
+    assert not list(check.hidden_machines("a.py", line))
+
+
+def test_long_files_need_a_reason_and_long_functions_have_none(check):
+    long_file = "x = 1\n" * 401
+    assert len(list(check.too_long("a.py", long_file))) == 1
+    assert not list(check.too_long("a.py", long_file + "# long because: one table\n"))
+    long_function = "def f():\n" + "    x = 1\n" * 80
+    assert len(list(check.too_long("a.py", long_function + "# long because: no\n"))) == 1
