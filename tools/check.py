@@ -30,7 +30,7 @@ def tool(*command: str) -> Callable[[], Iterator[str]]:
     def run() -> Iterator[str]:
         done = subprocess.run([str(BIN / command[0]), *command[1:]], cwd=ROOT, capture_output=True, text=True)
         if done.returncode:
-            yield (done.stdout + done.stderr).strip()
+            yield from (line for line in (done.stdout + done.stderr).splitlines() if line and ": note: " not in line)
 
     return run
 
@@ -84,7 +84,7 @@ CHECKS: dict[str, Callable[[], Iterator[str]]] = {
     "style": tool("ruff", "check", "--quiet", "--output-format", "concise", "."),
     "format": tool("ruff", "format", "--check", "--quiet", "--output-format", "concise", "."),
     "types": tool("mypy", "--no-error-summary"),
-    "walls": tool("lint-imports", "--no-cache"),
+    "walls": tool("lint-imports", "--no-cache", "--no-logo"),
     "house": house,
 }
 
