@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import sys
 import time
-from typing import Protocol, TextIO
+from typing import Protocol, runtime_checkable
 
 
+@runtime_checkable
 class Progress(Protocol):
     """Told by a stage: `step` how far it is, `value` a figure on the way."""
 
@@ -25,14 +26,24 @@ class Silent:
         pass
 
 
+class Stream(Protocol):
+    """What a console must be able to do: any text stream."""
+
+    def write(self, text: str, /) -> object: ...
+
+    def flush(self) -> None: ...
+
+    def isatty(self) -> bool: ...
+
+
 class Console:
     """One line on stderr with an estimate, shown only when the work takes over two seconds."""
 
     FIRST_SHOWN_S = 2.0
 
-    def __init__(self, label: str, stream: TextIO | None = None) -> None:
+    def __init__(self, label: str, stream: Stream | None = None) -> None:
         self._label = label
-        self._stream = stream if stream is not None else sys.stderr
+        self._stream: Stream = stream if stream is not None else sys.stderr
         self._every_s = 0.2 if self._stream.isatty() else 10.0
         self._started_s = time.monotonic()
         self._shown_s: float | None = None
