@@ -8,6 +8,7 @@ from typing import Protocol, runtime_checkable
 
 
 @runtime_checkable
+@runtime_checkable
 class Progress(Protocol):
     """Told by a stage: `step` how far it is, `value` a figure on the way."""
 
@@ -26,6 +27,7 @@ class Silent:
         pass
 
 
+@runtime_checkable
 class Stream(Protocol):
     """What a console must be able to do: any text stream."""
 
