@@ -8,7 +8,6 @@ from typing import Protocol, runtime_checkable
 
 
 @runtime_checkable
-@runtime_checkable
 class Progress(Protocol):
     """Told by a stage: `step` how far it is, `value` a figure on the way."""
 
