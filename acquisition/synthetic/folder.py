@@ -1,0 +1,228 @@
+"""Writes simulated tosses as the folder layout, and their truth as the `*_truth` layout beside it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float32, UInt8, UInt16
+from numpy import ndarray as Array
+
+from acquisition.synthetic import physics
+from acquisition.synthetic.paint import PaintedMesh
+from acquisition.synthetic.scene import Lab, SyntheticFrame, SyntheticToss, simulate
+from recordings.errors import BadInput, WriteFailed
+from recordings.geometry import CameraModel, Transform
+from recordings.progress import Progress, Silent
+
+TRUTH_DEPTH_UNIT_M = 0.0001
+STATES_HZ = 148.0
+TRUTH_SUFFIX = "_truth"
+PIXEL_CONVENTION = "OpenCV: centre of pixel (0,0) is at (0,0)"
+TAG_FAMILY = "tag36h11"
+
+
+def write_session(lab: Lab, tosses: Sequence[int], out: Path, progress: Progress | None = None) -> Path:
+    """Simulate `tosses` into the new folder `out`, truth into `out` + '_truth' (returned)."""
+    progress = progress or Silent()
+    truth = out.with_name(out.name + TRUTH_SUFFIX)
+    for folder in (out, truth):
+        if folder.exists():
+            raise BadInput(f"{folder} exists; wanted a new folder: choose another name, or remove it")
+    for folder in (out, truth):
+        folder.mkdir(parents=True)
+    _write_json(out / "session.json", session_document(lab))
+    write_truth_of_lab(lab, truth)
+    for done, number in enumerate(tosses):
+        write_toss(lab, simulate(lab.config, number, lab), out, truth)
+        progress.step(done + 1, len(tosses), f"toss {number}")
+    return truth
+
+
+def session_document(lab: Lab) -> dict[str, Any]:
+    """session.json of the folder layout: what the lab believes, calibration errors included."""
+    camera = lab.d455.camera
+    document: dict[str, Any] = {
+        "object": lab.config.object.shape,
+        "camera": {
+            "model": "D455-like",
+            **_intrinsics(camera),
+            "fps": lab.config.camera.fps,
+            "depth_unit_m": lab.config.depth.unit_m,
+            "depth_invalid": 0,
+            "depth_aligned_to_color": True,
+            "pixel_convention": PIXEL_CONVENTION,
+        },
+        "T_world_camera": lab.believed_world_from_d455.matrix.tolist(),
+        "world": "z up, table top is the plane z = 0, metres",
+        "camera_frame": "OpenCV (x right, y down, z forward)",
+        "table_tags": {
+            "family": TAG_FAMILY,
+            "note": "printed on the table; tag frame as pupil-apriltags reports it (x right, y down, z into the paper); "
+            "size_m is the side of the black square",
+            "tags": [
+                {"id": t.tag_id, "size_m": t.size_m, "T_world_tag": t.world_from_tag.matrix.tolist()}
+                for t in lab.table_tags
+            ],
+        },
+        "notes": f"simulated, seed {lab.config.seed}",
+    }
+    return document
+
+
+def write_truth_of_lab(lab: Lab, truth: Path) -> None:
+    """mesh.obj with its texture, physics.json, object_tags.json, calibration.json, sensor_truth.json."""
+    _write_mesh(lab.object.mesh, truth)
+    config = lab.config
+    _write_json(
+        truth / "physics.json",
+        {
+            "mass_kg": lab.mass.mass_kg,
+            "inertia_body_kgm2": lab.mass.inertia_kgm2.tolist(),
+            "com_in_mesh_frame": lab.mass.center_m.tolist(),
+            "friction_mu": config.contact.friction,
+            "torsional_friction_m": config.contact.torsional_friction_m,
+            "contact_time_constant_s": config.contact.time_constant_s,
+            "contact_damping_ratio": config.contact.damping_ratio,
+            "gravity": config.contact.gravity_m_s2,
+            "source": physics.SOURCE,
+        },
+    )
+    if lab.object_tags:
+        tags = [
+            {"id": t.tag_id, "size_m": t.size_m, "face": t.face, "T_object_tag": t.object_from_tag.matrix.tolist()}
+            for t in lab.object_tags
+        ]
+        convention = "T_object_tag: frame as pupil-apriltags reports it (x right, y down, z into the face)"
+        _write_json(truth / "object_tags.json", {"family": TAG_FAMILY, "convention": convention, "tags": tags})
+    _write_json(truth / "calibration.json", {"T_world_d455": lab.world_from_d455.matrix.tolist()})
+    _write_json(
+        truth / "sensor_truth.json",
+        {
+            "depth_scale": config.depth.scale,
+            "depth_delay_s": config.depth.delay_s,
+            "exposure_s": config.color.exposure_s,
+            "T_world_camera": lab.world_from_d455.matrix.tolist(),
+        },
+    )
+
+
+def write_toss(lab: Lab, toss: SyntheticToss, out: Path, truth: Path) -> None:
+    """One toss into toss_XX of both folders."""
+    name = f"toss_{toss.motion.toss:02d}"
+    here, there = out / name, truth / name
+    for folder in (here / "rgb", here / "depth", there / "masks", there / "depth_exact_object"):
+        folder.mkdir(parents=True)
+    for k, frame in enumerate(toss.frames):
+        _write_jpeg(here / "rgb" / f"{k:06d}.jpg", frame.color_rgb, lab.config.color.jpeg_quality)
+        _write_png(here / "depth" / f"{k:06d}.png", frame.depth_raw)
+        _write_png(there / "masks" / f"{k:06d}.png", _mask_picture(frame.mask))
+        exact = np.round(frame.depth_exact_object_m / TRUTH_DEPTH_UNIT_M).astype(np.uint16)
+        _write_png(there / "depth_exact_object" / f"{k:06d}.png", exact)
+    _write_png(here / "mask_first.png", _mask_picture(toss.frames[0].mask))
+    _write_times(here / "timestamps.txt", [f.time_s for f in toss.frames])
+    if lab.config.depth.delay_s != 0:
+        _write_times(here / "depth_timestamps.txt", [f.depth_time_s for f in toss.frames])
+    document: dict[str, Any] = {"frames": len(toss.frames)}
+    if lab.config.say_release:
+        document["release_time_s"] = toss.motion.instants.release_s
+    _write_json(here / "toss.json", document)
+    _write_truth_poses(lab, toss, there)
+
+
+def _write_truth_poses(lab: Lab, toss: SyntheticToss, there: Path) -> None:
+    instants, motion = toss.motion.instants, toss.motion.object
+    times = np.array([f.time_s for f in toss.frames])
+    world = np.array([f.world_from_object.matrix for f in toss.frames])
+    np.savez_compressed(
+        there / "poses_camera_object.npz",
+        t=times,
+        T_camera_object=lab.world_from_d455.inverse().matrix @ world,
+        T_world_object=world,
+        phase=np.array([instants.phase(t) for t in times]),
+        nominal_frame=np.array([f.nominal for f in toss.frames]),
+    )
+    np.savez_compressed(there / "states_148hz.npz", **_states(lab, toss))
+    _write_json(
+        there / "toss_gt.json",
+        {
+            "source_toss": "simulated",
+            "release_time_s": instants.release_s,
+            "first_contact_time_s": instants.first_impact_s,
+            "rest_time_s": instants.rest_s,
+            "dropped_nominal_frames": list(toss.dropped),
+            "exposure_gain": [f.brightness for f in toss.frames],
+            "simulated_until_s": float(motion.times_s[-1]),
+        },
+    )
+
+
+def _states(lab: Lab, toss: SyntheticToss) -> dict[str, Any]:
+    instants, motion = toss.motion.instants, toss.motion.object
+    times = instants.release_s + np.arange(int((instants.rest_s - instants.release_s) * STATES_HZ) + 1) / STATES_HZ
+    rows = np.clip(np.searchsorted(motion.times_s, times - 1e-9), 0, len(motion.times_s) - 1)
+    poses = [motion.at(t) for t in times]
+    spin_object = motion.angular_velocity_object_rad_s[rows]
+    return {
+        "t": times,
+        "position": np.array([p.translation_m for p in poses]),
+        "quaternion_wxyz": np.array([p.quaternion_wxyz for p in poses]),
+        "linear_velocity_world": motion.velocity_world_m_s[rows],
+        "angular_velocity_body": spin_object,
+        "angular_velocity_world": np.array([p.rotation @ w for p, w in zip(poses, spin_object)]),
+        "note": "SI, true world (z up, table z=0); quaternion world_from_body; position and velocity of the mesh origin; "
+        "t on the toss's clock, dt = 1/148 s",
+    }
+
+
+def _intrinsics(camera: CameraModel) -> dict[str, Any]:
+    return {
+        "K": camera.K.tolist(),
+        "distortion": list(camera.distortion) or [0.0] * 5,
+        "distortion_model": "Brown-Conrady, OpenCV order k1 k2 p1 p2 k3; applies to rgb and to the aligned depth",
+        "width": camera.width,
+        "height": camera.height,
+    }
+
+
+def _write_mesh(mesh: PaintedMesh, folder: Path) -> None:
+    """Wavefront OBJ with an sRGB texture (v axis up, as OBJ wants it)."""
+    from acquisition.synthetic.sensors import color_image
+
+    _write_png(folder / "texture.png", color_image(mesh.atlas)[..., ::-1])
+    (folder / "texture.mtl").write_text("newmtl texture\nKd 1 1 1\nmap_Kd texture.png\n")
+    height, width = mesh.atlas.shape[:2]
+    uv = (mesh.corner_uv_px.reshape(-1, 2) + 0.5) / [width, height]
+    lines = ["mtllib texture.mtl", "usemtl texture"]
+    lines += [f"v {x:.7f} {y:.7f} {z:.7f}" for x, y, z in mesh.vertices_m]
+    lines += [f"vt {u:.6f} {1 - v:.6f}" for u, v in uv]
+    for k, face in enumerate(mesh.faces):
+        lines.append("f " + " ".join(f"{vertex + 1}/{3 * k + i + 1}" for i, vertex in enumerate(face)))
+    (folder / "mesh.obj").write_text("\n".join(lines) + "\n")
+
+
+def _mask_picture(mask: Bool[Array, "h w"]) -> UInt8[Array, "h w"]:
+    return np.where(mask, 255, 0).astype(np.uint8)
+
+
+def _write_times(path: Path, times_s: Sequence[float]) -> None:
+    path.write_text("".join(f"{t:.6f}\n" for t in times_s))
+
+
+def _write_png(path: Path, image: UInt8[Array, "..."] | UInt16[Array, "..."]) -> None:
+    if not cv2.imwrite(str(path), image, [cv2.IMWRITE_PNG_COMPRESSION, 6]):
+        raise WriteFailed(f"{path}: cannot be written; is there space on the disk?")
+
+
+def _write_jpeg(path: Path, image: UInt8[Array, "..."], quality: int) -> None:
+    bgr = image[..., ::-1] if image.ndim == 3 else image
+    if not cv2.imwrite(str(path), bgr, [cv2.IMWRITE_JPEG_QUALITY, quality]):
+        raise WriteFailed(f"{path}: cannot be written; is there space on the disk?")
+
+
+def _write_json(path: Path, document: dict[str, Any]) -> None:
+    path.write_text(json.dumps(document, indent=1) + "\n")

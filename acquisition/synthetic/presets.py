@@ -1,0 +1,96 @@
+"""The variety that vision is tuned and judged on, as data: a name, and what differs from the usual scene."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+from acquisition.synthetic.config import (
+    CameraConfig,
+    ColorConfig,
+    DepthConfig,
+    ErrorConfig,
+    MotionConfig,
+    ObjectConfig,
+    SceneConfig,
+    Shape,
+    Surface,
+    TableStyle,
+)
+from recordings.errors import BadInput
+
+USUAL = SceneConfig()
+
+
+def _object(shape: Shape, surface: Surface, table: TableStyle = "wood", mass_kg: float = 0.3) -> SceneConfig:
+    return replace(USUAL, object=ObjectConfig(shape, surface=surface, mass_kg=mass_kg), table=table)
+
+
+BOX = _object("box", "textured", "speckled")
+
+PRESETS: dict[str, SceneConfig] = {
+    # objects
+    "cube-tagged": _object("cube", "tagged"),
+    "cube-textured": _object("cube", "textured", "speckled"),
+    "cube-few": _object("cube", "few", "plain"),
+    "cube-plain": _object("cube", "plain"),
+    "box-textured": BOX,
+    "box-few": _object("box", "few"),
+    "box-plain": _object("box", "plain", "plain"),
+    "box-glossy": _object("box", "glossy"),
+    "box-dark": _object("box", "dark", "speckled"),
+    "prism-textured": _object("prism", "textured"),
+    "prism-few": _object("prism", "few", "speckled"),
+    "prism-plain": _object("prism", "plain", "wood"),
+    "l-textured": _object("l", "textured", "plain"),
+    "l-few": _object("l", "few"),
+    "l-plain": _object("l", "plain", "speckled"),
+    "l-glossy": _object("l", "glossy"),
+    "mug-textured": _object("mug", "textured"),
+    "mug-few": _object("mug", "few", "plain"),
+    "mug-plain": _object("mug", "plain", "wood"),
+    "mug-glossy": _object("mug", "glossy", "speckled"),
+    "mug-dark": _object("mug", "dark", "plain"),
+    # motion
+    "spin-2": replace(BOX, motion=MotionConfig(spin_rad_s=2.0)),
+    "spin-12": replace(BOX, motion=MotionConfig(spin_rad_s=12.0)),
+    "spin-20": replace(BOX, motion=MotionConfig(spin_rad_s=20.0, lead_in_s=0.15)),
+    # camera
+    "near": replace(BOX, camera=CameraConfig(distance_m=0.55), motion=MotionConfig(release_height_m=0.2)),
+    "far": replace(BOX, camera=CameraConfig(distance_m=1.2)),
+    "distorted": replace(BOX, camera=CameraConfig(distortion=(-0.055, 0.065, 0.0006, -0.0004, -0.02))),
+    "dropped": replace(BOX, camera=CameraConfig(dropped_share=0.05)),
+    # light and exposure
+    "exposure-1ms": replace(BOX, color=ColorConfig(exposure_s=0.001)),
+    "exposure-16ms": replace(BOX, color=ColorConfig(exposure_s=0.016, subframes=16)),
+    "drift-40": replace(BOX, color=ColorConfig(drift=0.4)),
+    "dim": replace(BOX, color=ColorConfig(gain=0.4, noise=2.0)),
+    # depth
+    "depth-noise-2x": replace(BOX, depth=DepthConfig(noise=2.0)),
+    "depth-high-accuracy": replace(BOX, depth=DepthConfig(preset="high-accuracy")),
+    "depth-high-density": replace(BOX, depth=DepthConfig(preset="high-density")),
+    "depth-scale": replace(BOX, depth=DepthConfig(scale=1.004)),
+    "depth-late-8ms": replace(BOX, depth=DepthConfig(delay_s=0.008)),
+    "depth-late-16ms": replace(BOX, depth=DepthConfig(delay_s=0.016)),
+    # calibration
+    "pose-error": replace(BOX, errors=ErrorConfig(camera_m=0.003, camera_deg=0.3, plane_m=0.003, plane_deg=0.3)),
+    "no-release-time": replace(BOX, say_release=False),
+}
+
+
+def preset(name: str, seed: int | None = None) -> SceneConfig:
+    """The scene of a preset. Without a seed its place in the list is taken, so that every preset looks different."""
+    if name not in PRESETS:
+        raise BadInput(f"no preset '{name}'; there are: {', '.join(PRESETS)}")
+    return replace(PRESETS[name], seed=seed if seed is not None else 100 + list(PRESETS).index(name))
+
+
+def described() -> Iterator[str]:
+    """One line a preset: what differs from the usual scene."""
+    for name, config in PRESETS.items():
+        parts = [
+            repr(getattr(config, part))
+            for part in config.__dataclass_fields__
+            if getattr(config, part) != getattr(USUAL, part)
+        ]
+        yield f"{name}: {'; '.join(parts) or 'the usual scene'}"
