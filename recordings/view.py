@@ -1,0 +1,163 @@
+"""A session, a toss's file or a results folder in rerun: as an .rrd file, as a picture, or in the viewer's window."""
+
+from __future__ import annotations
+
+import os
+import sys
+import uuid
+from dataclasses import dataclass
+from pathlib import Path
+
+import rerun as rr
+
+from recordings.errors import BadInput, WriteFailed
+from recordings.mcap_file import McapFile
+from recordings.progress import Progress, Silent
+from recordings.results import Results
+from recordings.session import Session
+from recordings.session_writer import write_bytes
+from recordings.view_blueprint import ABOUT, about_text, blueprint
+from recordings.view_bodies import log_bodies, log_rig
+from recordings.view_layers import EVENTS, TIME, Clock, Look, log_toss
+from recordings.view_scene import Scene, moment_ns, result_bodies, results_scene, session_scene
+from recordings.view_viewer import Viewer, ViewerFailed, run_rerun
+
+APPLICATION = "tosslab"
+LOOK, SILENT = Look(), Silent()
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What of a path is shown. None: all tosses, all variants of the results (the likeliest one visible)."""
+
+    toss: int | None = None
+    variant: str | None = None
+    scope: str | None = None
+
+
+def save_rrd(path: Path, out: Path, choice: Choice = Choice(), look: Look = LOOK, progress: Progress = SILENT) -> None:
+    """Write what `toss-view PATH` shows to an .rrd file, whole or not at all.
+
+    A foreign .mcap goes through rerun's own loader.
+
+    Raises BadInput for a path that is nothing of the kind, or an `out` that exists; WriteFailed for the disk.
+    """
+    if out.exists():
+        raise BadInput(f"{out} exists already; nothing was written. Choose another name or remove it")
+    scene = None if is_foreign(path) else open_scene(path, choice)
+    partial = out.with_name(out.name + ".partial")
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        if scene is None:
+            run_rerun("mcap", "convert", str(path), "-o", str(partial))
+        else:
+            recording = _recording(scene)
+            recording.save(partial, default_blueprint=blueprint(scene))
+            fill(recording, scene, look, progress)
+            recording.disconnect()
+        partial.replace(out)
+    except OSError as refused:
+        raise WriteFailed(f"{out} cannot be written: {refused.strerror}") from refused
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def screenshot(
+    path: Path, out: Path, choice: Choice = Choice(), look: Look = LOOK, size: tuple[int, int] = (1280, 800)
+) -> None:
+    """Write a PNG of the viewer's window at a telling moment of the first toss (the middle of its flight). No display
+    is needed; a graphics driver is: ViewerFailed says which packages bring one."""
+    scene = None if is_foreign(path) else open_scene(path, choice)
+    with Viewer(headless=True, size=size) as viewer:
+        if scene is None:
+            viewer.client.open(str(path.resolve()))
+        else:
+            toss = scene.tosses[0]
+            stream(scene.only((toss,)), viewer, look)
+            shift_ns = scene.shift_ns[toss]
+            viewer.wait_for(TIME, scene.spans_ns[toss][1] + shift_ns)
+            viewer.show(TIME, moment_ns(scene, toss) + shift_ns)
+        picture = viewer.picture()
+    out.parent.mkdir(parents=True, exist_ok=True)
+    write_bytes(out, picture)
+
+
+def open_viewer(path: Path, choice: Choice = Choice(), look: Look = LOOK, progress: Progress = SILENT) -> None:
+    """Open the viewer's window and stay until it is closed. Raises ViewerFailed where there is no display."""
+    scene = None if is_foreign(path) else open_scene(path, choice)
+    if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise ViewerFailed(
+            "there is no display here for the viewer's window; "
+            f"write a file with `toss-view {path} --save out.rrd` and open it where there is one with `rerun out.rrd`, "
+            f"or make a picture with `toss-view {path} --screenshot out.png`"
+        )
+    with Viewer(headless=False, size=(1600, 1000)) as viewer:
+        if scene is None:
+            viewer.client.open(str(path.resolve()))
+        else:
+            stream(scene, viewer, look, progress)
+        viewer.wait_until_closed()
+
+
+def stream(scene: Scene, viewer: Viewer, look: Look = LOOK, progress: Progress = SILENT) -> None:
+    """Send a scene to a running viewer; returns when all of it has arrived."""
+    recording = _recording(scene)
+    recording.connect_grpc(viewer.url, default_blueprint=blueprint(scene))
+    fill(recording, scene, look, progress)
+    recording.flush()
+    recording.disconnect()
+
+
+def open_scene(path: Path, choice: Choice = Choice()) -> Scene:
+    """What is at a path: a session, one toss's file, or a results folder. Raises BadInput with what to type next."""
+    if path.is_dir() and Results.is_results(path):
+        scene = results_scene(Results.open(path), choice.variant, choice.scope)
+    else:
+        session = Session.open(path)
+        has_results = path.is_dir() and Results.is_results(path / "results")
+        if (choice.variant or choice.scope) and not has_results:
+            raise BadInput(f"{path} has no results, so no variant to choose; run `toss-process {path}` first")
+        found = result_bodies(Results.open(path), choice.variant, choice.scope) if has_results else []
+        scene = session_scene(session, found)
+    if choice.toss is None:
+        return scene
+    if choice.toss not in scene.tosses:
+        raise BadInput(f"{path} has no toss {choice.toss}; it has {', '.join(map(str, scene.tosses))}")
+    return scene.only((choice.toss,))
+
+
+def is_foreign(path: Path) -> bool:
+    """Whether this is an MCAP file of someone else, which rerun's own loader opens."""
+    if not path.is_file():
+        return False
+    with McapFile(path) as file:
+        return not file.metadata("tosslab")
+
+
+def fill(recording: rr.RecordingStream, scene: Scene, look: Look, progress: Progress) -> None:
+    """Log all of a scene, toss by toss, so that a live viewer has the first one at once."""
+    recording.log(ABOUT, rr.TextDocument(about_text(scene), media_type=rr.MediaType.MARKDOWN), static=True)
+    log_rig(recording, scene, look)
+    for toss in scene.tosses:
+        clock = Clock(recording, toss, scene.shift_ns[toss])
+        start_ns, end_ns = scene.spans_ns[toss]
+        clear(clock.at(start_ns))
+        clock.at(start_ns).log(EVENTS, rr.TextLog(f"toss {toss}: recording begins"))
+        log_bodies(recording, scene, toss)
+        log_toss(recording, scene, toss, look, progress)
+        recording.flush()  # the end is the last to arrive: who sees it has all of the toss
+        clock.at(end_ns).log(EVENTS, rr.TextLog(f"toss {toss}: recording ends"))
+
+
+def clear(recording: rr.RecordingStream) -> None:
+    """Nothing of the toss before is left in the picture when the next one begins."""
+    for entity in ("world/seen_by", "world/cameras", "depth", "world/path"):
+        recording.log(entity, rr.Clear(recursive=True))
+
+
+def _recording(scene: Scene) -> rr.RecordingStream:
+    recording = rr.RecordingStream(APPLICATION, recording_id=uuid.uuid4())
+    rr.set_log_time_enabled(False, recording=recording)  # one time line: the session clock's
+    rr.set_log_tick_enabled(False, recording=recording)
+    recording.send_recording_name(scene.name)
+    return recording

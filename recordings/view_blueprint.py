@@ -1,0 +1,176 @@
+"""How the viewer's window is laid out, and the words that explain it."""
+
+from __future__ import annotations
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+from jaxtyping import Float
+from numpy import ndarray as Array
+
+from recordings.view_bodies import BODY, PATH
+from recordings.view_layers import ARM, COLOR, DEPTH, EVENTS, FRAMES, HEALTH, MOTION, TIME, Clock
+from recordings.view_scene import Scene, root_poses
+
+ABOUT = "about"
+EYE_FROM_TARGET = np.array([0.8, -0.95, 0.55])
+"""Where the first look comes from, in world axes: from the right, behind the colour camera's shoulder, from above."""
+SLOW = 0.25
+
+
+def blueprint(scene: Scene) -> rrb.Blueprint:
+    """The table in 3D on the left; images and plots on the right; time over the first toss, four times slowed down."""
+    right = [container for container in (_images(scene), _plots(scene), _words(scene)) if container is not None]
+    return rrb.Blueprint(
+        rrb.Horizontal(_space(scene), rrb.Vertical(*right, row_shares=[4, 2, 2][: len(right)]), column_shares=[3, 2]),
+        _time_panel(scene),
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+        rrb.TopPanel(state="collapsed"),
+        auto_views=False,
+    )
+
+
+def _time_panel(scene: Scene) -> rrb.TimePanel:
+    toss = scene.tosses[0]
+    clock = Clock(rr.RecordingStream("unused"), toss, scene.shift_ns[toss])
+    start, end = (clock.shown(t) for t in scene.spans_ns[toss])
+    return rrb.TimePanel(
+        state="collapsed",
+        timeline=TIME,
+        playback_speed=SLOW,
+        play_state="playing",
+        loop_mode="selection",
+        time_selection=rr.encodings.AbsoluteTimeRange(min=start.astype(int), max=end.astype(int)),
+    )
+
+
+def _space(scene: Scene) -> rrb.Spatial3DView:
+    hidden = [body for body in scene.bodies if not body.shown]
+    paths = [e.format(body.name) for body in hidden for e in (BODY, PATH)]
+    overrides = {path: rrb.EntityBehavior(visible=False) for path in paths}
+    if scene.root != "world":
+        return rrb.Spatial3DView(origin="world", name=f"As seen from {scene.root}", overrides=overrides)
+    target = centre_m(scene)
+    grid = rrb.LineGrid3D(visible=True, spacing=0.1, color=[120, 120, 120, 90], stroke_width=1.0)
+    eye = rrb.EyeControls3D(
+        position=target + EYE_FROM_TARGET * reach_m(scene, target), look_target=target, eye_up=[0, 0, 1]
+    )
+    return rrb.Spatial3DView(
+        origin="world", name="The table in 3D", overrides=overrides, line_grid=grid, eye_controls=eye
+    )
+
+
+def centre_m(scene: Scene) -> Float[Array, "3"]:
+    """What the first look is at: between the middle of the first toss's motion and the middle of the cameras."""
+    moved = np.array([0.0, 0.0, 0.1])
+    for body in scene.bodies:
+        _, matrices = root_poses(scene, body.poses.get(scene.tosses[0], ()))
+        known = matrices[np.isfinite(matrices).all(axis=(1, 2)), :3, 3]
+        if len(known):
+            moved = (known.min(axis=0) + known.max(axis=0)) / 2
+            break
+    cameras = camera_places_m(scene)
+    return moved + 0.35 * (cameras.mean(axis=0) - moved) if len(cameras) else moved
+
+
+def reach_m(scene: Scene, target: Float[Array, "3"]) -> float:
+    """How far the look stands back, so that every camera fits in."""
+    far = np.linalg.norm(camera_places_m(scene) - target, axis=1)
+    return float(np.clip(far.max(initial=0.5) * 1.3, 0.5, 4.0))
+
+
+def camera_places_m(scene: Scene) -> Float[Array, "n 3"]:
+    """Where the cameras are, in the root frame."""
+    places = [scene.root_from(camera.frame) for camera in scene.calibration.cameras.values()]
+    return np.array([p.translation_m for p in places if p is not None], dtype=np.float64).reshape(-1, 3)
+
+
+def _images(scene: Scene) -> rrb.Container | None:
+    """Colour and depth in one row, the ground-truth cameras in the next."""
+    cameras = sorted({name for toss in scene.tosses for name in _cameras(scene, toss)})
+    mono = [name for name in cameras if _is_mono(scene, name)]
+    first = [rrb.Spatial2DView(origin=COLOR.format(c), name=f"Colour of {c}") for c in cameras if c not in mono]
+    if any(_has_depth(scene, toss) for toss in scene.tosses):
+        first.append(rrb.Spatial2DView(origin=DEPTH.format("d455"), name="Depth"))
+    second = [rrb.Spatial2DView(origin=COLOR.format(name), name=name) for name in mono]
+    rows = [rrb.Horizontal(*views) for views in (first, second) if views]
+    return rrb.Vertical(*rows, row_shares=[3, 2][: len(rows)], name="Images") if rows else None
+
+
+def _is_mono(scene: Scene, camera: str) -> bool:
+    recorded = (scene.toss(toss) for toss in scene.tosses)
+    return any(toss is not None and f"/{camera}/image" in toss.file.channels for toss in recorded)
+
+
+def _cameras(scene: Scene, toss: int) -> tuple[str, ...]:
+    recorded = scene.toss(toss)
+    return recorded.cameras() if recorded is not None else ()
+
+
+def _has_depth(scene: Scene, toss: int) -> bool:
+    recorded = scene.toss(toss)
+    return recorded is not None and len(recorded.depth()) > 0
+
+
+def _plots(scene: Scene) -> rrb.Container | None:
+    recorded = [toss for toss in (scene.toss(i) for i in scene.tosses) if toss is not None]
+    plots = []
+    if scene.bodies:
+        if scene.root == "world":
+            plots.append(rrb.TimeSeriesView(origin=f"{MOTION}/height_m", name="Height (m)"))
+        plots.append(rrb.TimeSeriesView(origin=f"{MOTION}/speed_m_s", name="Speed (m/s)"))
+        plots.append(rrb.TimeSeriesView(origin=f"{MOTION}/spin_rad_s", name="Spin (rad/s)"))
+    if any("/arm/joint_states" in toss.file.channels for toss in recorded):
+        plots.append(rrb.TimeSeriesView(origin=f"{ARM}/angles_rad", name="Arm joints (rad)"))
+        plots.append(rrb.TimeSeriesView(origin=f"{ARM}/speeds_rad_s", name="Joint speeds (rad/s)"))
+        plots.append(rrb.TimeSeriesView(origin=f"{ARM}/finger_width_m", name="Gripper (m)"))
+    if any(toss.cameras() for toss in recorded):
+        plots.append(rrb.TimeSeriesView(origin=FRAMES, name="Frame gaps (ms)"))
+    return rrb.Tabs(*plots, name="Plots") if plots else None
+
+
+def _words(scene: Scene) -> rrb.Container:
+    events = rrb.TextLogView(origin="/", contents=[f"+ /{EVENTS}", f"+ /{HEALTH}"], name="Events and health")
+    return rrb.Tabs(rrb.TextDocumentView(origin=ABOUT, name="What you see"), events, name="Words")
+
+
+def about_text(scene: Scene) -> str:
+    """What is on the screen, for someone who sees it for the first time (Markdown)."""
+    lines = [f"# {scene.name}", f"{len(scene.tosses)} toss(es) of **{_object_name(scene)}**.", ""]
+    if scene.session is not None and scene.session.calibration.cameras:
+        lines += ["- **Points**: what the depth camera measured, in its own colours."]
+        lines += ["- **Pyramids**: the cameras, with the image each one sees."]
+    if scene.calibration.table_tags:
+        lines += ["- **Yellow squares**: the table's tags where the calibration has them."]
+    for body in scene.bodies:
+        hidden = "" if body.shown else " (hidden: click its eye in the list of entities)"
+        lines += [f"- **{_color_word(body.color)}**: {body.label}, and its way through the toss{hidden}."]
+    lines += [
+        "",
+        "Space starts and stops. The yellow range of the time line is the first toss; drag it to another.",
+        "",
+    ]
+    lines += ["| toss | from (s) | to (s) |", "|---|---|---|"]
+    for toss in scene.tosses:
+        start, end = ((t + scene.shift_ns[toss]) / 1e9 for t in scene.spans_ns[toss])
+        lines += [f"| {toss} | {start:.3f} | {end:.3f} |"]
+    if scene.notes:
+        lines += ["", "**Not as complete as it could be**", *(f"- {note}" for note in scene.notes)]
+    return "\n".join(lines)
+
+
+def _object_name(scene: Scene) -> str:
+    return scene.session.object_name if scene.session is not None else "the object"
+
+
+def _color_word(color: tuple[int, int, int]) -> str:
+    words = {
+        (60, 200, 90): "Green",
+        (255, 140, 0): "Orange",
+        (220, 60, 180): "Pink",
+        (250, 220, 60): "Yellow",
+        (120, 120, 255): "Violet",
+        (60, 150, 255): "Blue",
+    }
+    return words.get(color, str(color))

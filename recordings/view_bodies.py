@@ -1,0 +1,216 @@
+"""What stands still (cameras, table tags) and what moves (the object as truth and estimates have it), in rerun."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import rerun as rr
+from jaxtyping import Float, Int64
+from numpy import ndarray as Array
+
+from recordings.geometry import CameraModel, Transform, quaternion_from_rotation, rotation_angle_rad
+from recordings.tracks import RigCalibration, TagPlacement
+from recordings.view_layers import COLOR, MOTION, Clock, Look
+from recordings.view_outline import Outline
+from recordings.view_scene import Body, Color, Scene, root_poses
+
+BODY, PATH, TAGS = "world/object/{}", "world/path/{}", "world/table_tags"
+OUTLINE, TAGS_SEEN = COLOR + "/outline_{}", COLOR + "/table_tags"
+CAMERA_COLORS: dict[bool, Color] = {True: (90, 170, 255), False: (170, 170, 170)}
+TAG_COLOR: Color = (255, 225, 60)
+SOLID = 190
+"""Opacity of a mesh: what was measured shines through."""
+AXES_M = 0.06
+
+
+def log_rig(recording: rr.RecordingStream, scene: Scene, look: Look) -> None:
+    """The world's axes, cameras with their frusta, the table's tags in the world and in the images."""
+    upright = rr.ViewCoordinates.RIGHT_HAND_Z_UP if scene.root == "world" else rr.ViewCoordinates.RDF
+    recording.log("world", upright, static=True)
+    if scene.root == "world":
+        recording.log("world/origin", rr.TransformAxes3D(0.1), static=True)
+    for name, model in scene.calibration.cameras.items():
+        if not name.endswith("_depth"):
+            log_camera(recording, scene, name, model, look)
+    log_table_tags(recording, scene.calibration)
+
+
+def log_camera(recording: rr.RecordingStream, scene: Scene, name: str, model: CameraModel, look: Look) -> None:
+    """A frustum with its image at the camera's place; without a place the image is shown flat only."""
+    place = scene.root_from(model.frame)
+    if place is None:
+        return
+    color = CAMERA_COLORS["mono" not in name]
+    holder = f"world/cameras/{name}"
+    recording.log(holder, placed(place), static=True)
+    recording.log(f"{holder}/name", rr.Points3D([[0, 0, 0]], labels=[name], colors=[color], radii=[0.004]), static=True)
+    pinhole = rr.Pinhole(
+        image_from_camera=model.K,
+        width=model.width,
+        height=model.height,
+        image_plane_distance=look.frustum_m,
+        color=color,
+    )
+    recording.log(COLOR.format(name), pinhole, static=True)
+
+
+def log_table_tags(recording: rr.RecordingStream, calibration: RigCalibration) -> None:
+    """Where the calibration has the table's tags: outlines on the table and, through the lens, in every image."""
+    tags = calibration.table_tags
+    if not tags:
+        return
+    corners = [tag_corners_world(tag) for tag in tags]
+    labels = [f"tag {tag.tag_id}" for tag in tags]
+    loops = [np.vstack([c, c[:1]]) for c in corners]
+    recording.log(TAGS, rr.LineStrips3D(loops, colors=[TAG_COLOR], labels=labels, radii=0.0015), static=True)
+    for name, model in calibration.cameras.items():
+        camera_from_world = calibration.find(model.frame, "world")
+        if camera_from_world is None or name.endswith("_depth"):
+            continue
+        seen = [model.project(camera_from_world.points(loop)) for loop in loops]
+        seen = [pixels for pixels in seen if model.sees(pixels).all()]
+        if seen:
+            strips = rr.LineStrips2D(seen, colors=[TAG_COLOR], radii=-1.0)
+            recording.log(TAGS_SEEN.format(name), strips, static=True)
+
+
+def tag_corners_world(tag: TagPlacement) -> Float[Array, "4 3"]:
+    """Corners of the black square in the world, in the order of pupil-apriltags: (-,+), (+,+), (+,-), (-,-)."""
+    h = tag.size_m / 2
+    return tag.world_from_tag.points(np.array([[-h, h, 0.0], [h, h, 0.0], [h, -h, 0.0], [-h, -h, 0.0]]))
+
+
+def log_bodies(recording: rr.RecordingStream, scene: Scene, toss: int) -> None:
+    """Every body in one toss: its shape, its moving pose, its path, its outline in the colour image, its motion."""
+    clock = Clock(recording, toss, scene.shift_ns[toss])
+    start_ns = scene.spans_ns[toss][0]
+    for body in scene.bodies:
+        entity = BODY.format(body.name)
+        hide(clock, entity, start_ns)
+        times_ns, matrices = root_poses(scene, body.poses.get(toss, ()))
+        log_path(clock, body, start_ns, matrices)
+        if len(times_ns) == 0:
+            continue
+        log_shape(clock, scene, body, toss, matrices)
+        log_poses(clock, entity, times_ns, matrices)
+        log_motion(clock, scene, body, times_ns, matrices)
+        if body.shown:
+            log_outlines(clock, scene, body, times_ns, matrices)
+
+
+def hide(clock: Clock, entity: str, time_ns: int) -> None:
+    """A body that is lost, or not in this toss, is scaled away: nothing is drawn at a place that nobody knows."""
+    clock.at(time_ns).log(entity, rr.Transform3D(translation=[0, 0, 0], quaternion=[0, 0, 0, 1], scale=[0, 0, 0]))
+
+
+def log_shape(clock: Clock, scene: Scene, body: Body, toss: int, matrices: Float[Array, "n 4 4"]) -> None:
+    """The mesh in the body's colour; where no shape is known, axes and a box as high as the pose rests."""
+    entity, start_ns = BODY.format(body.name), scene.spans_ns[toss][0]
+    shape = body.shape(toss)
+    if shape is not None:
+        mesh = rr.Mesh3D(
+            vertex_positions=shape.vertices_m.astype(np.float32),
+            triangle_indices=shape.faces.astype(np.uint32),
+            albedo_factor=(*body.color, SOLID),
+        )
+        clock.at(start_ns).log(f"{entity}/shape", mesh)
+        return
+    clock.at(start_ns).log(f"{entity}/axes", rr.TransformAxes3D(AXES_M))
+    half_m = guessed_half_m(scene, matrices)
+    if half_m is not None:
+        box = rr.Boxes3D(half_sizes=[[half_m] * 3], colors=[body.color], labels=["shape not known"])
+        clock.at(start_ns).log(f"{entity}/box", box)
+
+
+def guessed_half_m(scene: Scene, matrices: Float[Array, "n 4 4"]) -> float | None:
+    """How high above the table the body's origin rests, if that is plausible as half the size of an object."""
+    heights = matrices[np.isfinite(matrices[:, 2, 3]), 2, 3]
+    if scene.root != "world" or len(heights) == 0 or not 0.005 < heights[-1] < 0.2:
+        return None
+    return float(heights[-1])
+
+
+def log_poses(clock: Clock, entity: str, times_ns: Int64[Array, " n"], matrices: Float[Array, "n 4 4"]) -> None:
+    known = np.isfinite(matrices).all(axis=(1, 2))
+    safe = np.where(known[:, None, None], matrices, np.eye(4))
+    wxyz = np.array([quaternion_from_rotation(m[:3, :3]) for m in safe])
+    columns = rr.Transform3D.columns(
+        translation=safe[:, :3, 3],
+        quaternion=wxyz[:, [1, 2, 3, 0]],
+        scale=np.repeat(known[:, None], 3, axis=1).astype(float),
+    )
+    clock.columns(entity, times_ns, columns)
+
+
+def log_path(clock: Clock, body: Body, start_ns: int, matrices: Float[Array, "n 4 4"]) -> None:
+    """The way of the body's origin through the toss; broken where it was lost."""
+    strips = unbroken(matrices[:, :3, 3])
+    clock.at(start_ns).log(PATH.format(body.name), rr.LineStrips3D(strips, colors=[body.color], radii=0.001))
+
+
+def unbroken(points: Float[Array, "n 3"]) -> list[Float[Array, "m 3"]]:
+    """Runs of finite points, each of two or more."""
+    known = np.isfinite(points).all(axis=1)
+    edges = np.flatnonzero(np.diff(np.r_[False, known, False].astype(int)))
+    return [points[a:b] for a, b in zip(edges[::2], edges[1::2]) if b - a > 1]
+
+
+def log_motion(
+    clock: Clock, scene: Scene, body: Body, times_ns: Int64[Array, " n"], matrices: Float[Array, "n 4 4"]
+) -> None:
+    """Height over the table, speed and spin as plots; a lost frame leaves a gap."""
+    values = {"speed_m_s": speeds_m_s(times_ns, matrices), "spin_rad_s": spins_rad_s(times_ns, matrices)}
+    if scene.root == "world":
+        values["height_m"] = matrices[:, 2, 3]
+    for name, value in values.items():
+        entity = f"{MOTION}/{name}/{body.name}"
+        style = rr.SeriesLines(names=[body.label], colors=[body.color])
+        clock.at(int(times_ns[0])).log(entity, style, static=True)
+        clock.columns(entity, times_ns, rr.Scalars.columns(scalars=value))
+
+
+def speeds_m_s(times_ns: Int64[Array, " n"], matrices: Float[Array, "n 4 4"]) -> Float[Array, " n"]:
+    """|p[k] - p[k-1]| / dt; the first is NaN."""
+    steps = np.linalg.norm(np.diff(matrices[:, :3, 3], axis=0), axis=1)
+    return np.r_[np.nan, steps / np.maximum(np.diff(times_ns) / 1e9, 1e-9)]
+
+
+def spins_rad_s(times_ns: Int64[Array, " n"], matrices: Float[Array, "n 4 4"]) -> Float[Array, " n"]:
+    """Angle between neighbouring rotations over dt; the first is NaN, as is every step to or from a lost frame."""
+    turns = np.full(len(matrices), np.nan)
+    for k in range(1, len(matrices)):
+        turn = matrices[k - 1, :3, :3].T @ matrices[k, :3, :3]
+        if np.isfinite(turn).all():
+            turns[k] = rotation_angle_rad(turn)
+    turns[1:] /= np.maximum(np.diff(times_ns) / 1e9, 1e-9)
+    return turns
+
+
+def log_outlines(
+    clock: Clock,
+    scene: Scene,
+    body: Body,
+    times_ns: Int64[Array, " n"],
+    matrices: Float[Array, "n 4 4"],
+    camera: str = "d455",
+) -> None:
+    """The body's outline over the colour image, projected through the lens at each pose."""
+    shape, model = body.shape(clock.toss), scene.calibration.cameras.get(camera)
+    camera_from_root = scene.calibration.find(model.frame, scene.root) if model is not None else None
+    if shape is None or model is None or camera_from_root is None:
+        return
+    outline = Outline.of(shape)
+    for time_ns, matrix in zip(times_ns, matrices):
+        segments: Sequence[Float[Array, "2 2"]] = ()
+        if np.isfinite(matrix).all():
+            root_from_object = Transform.from_matrix(scene.root, shape.object_frame, matrix)
+            segments = list(outline.segments(model, camera_from_root @ root_from_object))
+        strips = rr.LineStrips2D(segments, colors=[body.color], radii=-1.0)
+        clock.at(int(time_ns)).log(OUTLINE.format(camera, body.name), strips)
+
+
+def placed(place: Transform) -> rr.Transform3D:
+    """A transform that stands still."""
+    w, x, y, z = place.quaternion_wxyz
+    return rr.Transform3D(translation=place.translation_m, quaternion=[x, y, z, w])
