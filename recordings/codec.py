@@ -11,25 +11,25 @@ from typing import Any, TypeVar
 
 import cv2
 import numpy as np
-import zstandard
 from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
-from foxglove_schemas_protobuf.JointStates_pb2 import JointStates
 from foxglove_schemas_protobuf.Log_pb2 import Log
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf.descriptor import FileDescriptor
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from google.protobuf.message import DecodeError
-from jaxtyping import Float, UInt8, UInt16
+from jaxtyping import Float, UInt8
 from numpy import ndarray as Array
 
+from recordings.depth_codec import DEPTH_CODEC
+from recordings.depth_codec import pack_depth as pack_depth
+from recordings.depth_codec import unpack_depth as unpack_depth
 from recordings.errors import BadInput, DamagedFile
 from recordings.geometry import CameraModel, DistortionModel, Transform, quaternion_from_rotation
 from recordings.mcap_file import Message
 from recordings.records import (
-    ArmStates,
     DepthImage,
     EncodedImage,
     HealthLine,
@@ -40,8 +40,6 @@ from recordings.records import (
 )
 from recordings.schemas import tosslab_pb2 as own
 
-DEPTH_CODEC = "delta-planes-zstd"
-FINGERS = ("panda_finger_joint1", "panda_finger_joint2")
 _LEVELS = {"info": Log.INFO, "warning": Log.WARNING, "error": Log.ERROR}
 _FOXGLOVE_MODELS: dict[DistortionModel, str] = {
     "none": "plumb_bob",
@@ -172,37 +170,6 @@ def read_depth(message: Message, camera: str, schema: str, unit_m: float) -> Dep
     return DepthImage(camera, message.sequence, _time_ns(box.timestamp), message.log_time_ns, unit_m, raw)
 
 
-def pack_depth(raw: UInt16[Array, "h w"]) -> bytes:
-    """Row differences modulo 2^16, zigzag, low bytes then high bytes, zstd level 1 (schemas/tosslab.proto)."""
-    values = np.ascontiguousarray(raw, dtype=np.uint16).view(np.int16)
-    delta = np.empty_like(values)
-    delta[:, 0] = values[:, 0]
-    np.subtract(values[:, 1:], values[:, :-1], out=delta[:, 1:])
-    sign = delta >> 15
-    np.left_shift(delta, 1, out=delta)
-    np.bitwise_xor(delta, sign, out=delta)
-    pairs = delta.view(np.uint8).reshape(-1, 2)
-    planes = np.empty((2, len(pairs)), dtype=np.uint8)
-    planes[0], planes[1] = pairs[:, 0], pairs[:, 1]
-    return zstandard.ZstdCompressor(level=1).compress(planes.data)
-
-
-def unpack_depth(data: bytes, height: int, width: int) -> UInt16[Array, "h w"]:
-    """The inverse of pack_depth. Raises DamagedFile when the bytes do not hold height x width values."""
-    size = 2 * height * width
-    try:
-        if not 0 < size <= 1 << 28 or zstandard.frame_content_size(data) != size:
-            raise ValueError(f"they do not hold {width}x{height} values")
-        planes = np.frombuffer(zstandard.ZstdDecompressor().decompress(data), dtype=np.uint8).reshape(2, -1)
-    except (zstandard.ZstdError, ValueError) as wrong:
-        raise DamagedFile(f"a depth image's {len(data)} bytes cannot be unpacked: {wrong}") from wrong
-    pairs = np.empty((planes.shape[1], 2), dtype=np.uint8)
-    pairs[:, 0], pairs[:, 1] = planes[0], planes[1]
-    zigzag = pairs.reshape(-1).view(np.uint16).reshape(height, width)
-    delta = (zigzag >> 1) ^ (0 - (zigzag & 1))
-    return np.cumsum(delta, axis=1, dtype=np.uint16)
-
-
 def encode_calibration(camera: CameraModel, time_ns: int) -> Payload:
     P = np.zeros((3, 4))
     P[:, :3] = camera.K
@@ -229,37 +196,6 @@ def encode_transforms(transforms: tuple[Transform, ...], time_ns: int) -> Payloa
         _set_xyz(one.translation, t.translation_m)
         _set_quaternion(one.rotation, t.rotation)
     return Payload(FrameTransforms, message.SerializeToString())
-
-
-def encode_arm(states: ArmStates, sample: int) -> Payload:
-    """One sample; the finger width becomes the URDF's two finger joints, half of it each."""
-    message = JointStates()
-    _stamp(message.timestamp, int(states.time_ns[sample]))
-    for name, q, dq in zip(states.joint_names, states.q_rad[sample], states.dq_rad_s[sample], strict=True):
-        message.joints.add(name=name, position=q, velocity=dq)
-    width_m = float(states.finger_width_m[sample])
-    if np.isfinite(width_m):
-        for finger in FINGERS:
-            message.joints.add(name=finger, position=width_m / 2)
-    return Payload(JointStates, message.SerializeToString())
-
-
-def read_arm(messages: list[Message]) -> ArmStates:
-    """All samples of a toss. Raises BadInput when the joints change within it."""
-    boxes = [_parse(JointStates, m) for m in messages]
-    names = tuple(j.name for j in boxes[0].joints if j.name not in FINGERS)
-    q = np.empty((len(boxes), len(names)))
-    dq = np.empty_like(q)
-    width_m = np.full(len(boxes), np.nan)
-    for i, box in enumerate(boxes):
-        arm = [j for j in box.joints if j.name not in FINGERS]
-        if tuple(j.name for j in arm) != names:
-            raise BadInput(f"/arm/joint_states: sample {i} has joints {[j.name for j in arm]}, the first has {list(names)}")
-        q[i], dq[i] = [j.position for j in arm], [j.velocity for j in arm]
-        fingers = [j.position for j in box.joints if j.name in FINGERS]
-        if fingers:
-            width_m[i] = sum(fingers)
-    return ArmStates(np.array([_time_ns(b.timestamp) for b in boxes], dtype=np.int64), names, q, dq, width_m)
 
 
 def encode_pose(pose: StampedPose) -> Payload:
@@ -293,7 +229,9 @@ def read_pose(message: Message, quality: Message | None) -> StampedPose:
     status = beside.status if beside is not None else "tracked"
     if status not in ("tracked", "interpolated", "lost"):
         raise DamagedFile(f"{message.topic}: status '{status}'; wanted tracked, interpolated or lost")
-    covariance = np.array(beside.covariance).reshape(6, 6) if beside is not None and len(beside.covariance) == 36 else None
+    covariance = (
+        np.array(beside.covariance).reshape(6, 6) if beside is not None and len(beside.covariance) == 36 else None
+    )
     source = beside.source_frame if beside is not None else "object"
     return StampedPose(_time_ns(box.timestamp), box.frame_id, source, matrix, status, covariance)
 
@@ -398,7 +336,10 @@ def _stamp(timestamp: Any, time_ns: int) -> None:
 
 
 def _time_ns(timestamp: Any) -> int:
-    return int(timestamp.seconds) * _NANOS + int(timestamp.nanos)
+    time_ns = int(timestamp.seconds) * _NANOS + int(timestamp.nanos)
+    if not -(1 << 63) <= time_ns < 1 << 63:
+        raise DamagedFile(f"a message is stamped {timestamp.seconds} s, which is no time; wanted 64-bit nanoseconds")
+    return time_ns
 
 
 def _set_xyz(vector: Any, values: Float[Array, "3"]) -> None:

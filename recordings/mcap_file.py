@@ -29,13 +29,25 @@ from mcap.summary import Summary
 from numpy import ndarray as Array
 
 from recordings.errors import BadInput, DamagedFile
-from recordings.mcap_writer import MAGIC
+from recordings.mcap_writer import LATEST_NS, MAGIC
 
 CACHED_CHUNKS = 4
 MAX_CHUNK_BYTES = 1 << 30
 _MESSAGE_HEAD = struct.Struct("<BQHIQQ")
 _CHUNK_HEAD = struct.Struct("<BQQQQI")
-_RAISED = (McapError, ValueError, KeyError, IndexError, struct.error, EOFError, OverflowError, MemoryError, OSError)
+RAISED = (
+    McapError,
+    ValueError,
+    KeyError,
+    IndexError,
+    struct.error,
+    EOFError,
+    OverflowError,
+    MemoryError,
+    OSError,
+    AssertionError,
+)
+"""What mcap and Python raise on bytes that are not what they should be."""
 T = TypeVar("T")
 
 
@@ -77,13 +89,22 @@ class McapFile:
 
     @cached_property
     def channels(self) -> dict[str, Channel]:
-        """Channels by topic. Two channels of one topic are refused: tosslab writes one."""
+        """Channels by topic. Where several carry one topic (other writers do that), the first that has messages."""
         found: dict[str, Channel] = {}
         for channel in self.summary.channels.values():
-            if channel.topic in found and self.count(channel.id) == 0:
-                continue
-            found[channel.topic] = channel
+            if channel.topic not in found or (self.count(channel.id) and not self.count(found[channel.topic].id)):
+                found[channel.topic] = channel
         return found
+
+    @cached_property
+    def _ids(self) -> dict[str, frozenset[int]]:
+        """All channels of a topic that say the same of their messages as the one in `channels`."""
+        ids: dict[str, set[int]] = {}
+        for channel in self.summary.channels.values():
+            first = self.channels[channel.topic]
+            if (channel.schema_id, channel.message_encoding) == (first.schema_id, first.message_encoding):
+                ids.setdefault(channel.topic, set()).add(channel.id)
+        return {topic: frozenset(numbers) for topic, numbers in ids.items()}
 
     def schema(self, topic: str) -> Schema | None:
         return self.summary.schemas.get(self.channels[topic].schema_id)
@@ -97,11 +118,11 @@ class McapFile:
         if topic not in self.channels:
             return TopicIndex.empty()
         if topic not in self._indexes:
-            self._indexes[topic] = self._guard(lambda: self._read_index(self.channels[topic].id), f"the index of {topic}")
+            self._indexes[topic] = self._guard(lambda: self._read_index(self._ids[topic]), f"the index of {topic}")
         return self._indexes[topic]
 
     def read(self, topic: str, position: int) -> Message:
-        """The message at a position (0-based, log-time order) of a topic."""
+        """The message at a position (0-based, log-time order) of a topic. Raises IndexError behind the last one."""
         index = self.topic_index(topic)
         chunk = self._chunk(int(index.chunk[position]))
         offset = int(index.offset[position])
@@ -116,8 +137,9 @@ class McapFile:
         index = self.topic_index(topic)
         times = np.empty(len(index), dtype=np.int64)
         for i in range(len(index)):
-            head = self._guard(lambda i=i: self._head(int(index.chunk[i]), int(index.offset[i])), f"message {i} of {topic}")
-            times[i] = head[5]
+            times[i] = self._guard(
+                lambda i=i: self._publish_time(int(index.chunk[i]), int(index.offset[i])), f"message {i} of {topic}"
+            )
         return times
 
     def metadata(self, name: str) -> list[dict[str, str]]:
@@ -157,7 +179,7 @@ class McapFile:
             return read()
         except BadInput:
             raise
-        except _RAISED as wrong:
+        except RAISED as wrong:
             raise DamagedFile(
                 f"{self.path}: {what} is damaged ({type(wrong).__name__}: {str(wrong)[:120]}). What can be read can be "
                 f"saved: `toss-session recover {self.path} NEW.mcap`"
@@ -190,29 +212,40 @@ class McapFile:
                 raise ValueError(f"topic {channel.topic} names a schema that is not there")
         return summary
 
-    def _read_index(self, channel: int) -> TopicIndex:
+    def _read_index(self, channels: frozenset[int]) -> TopicIndex:
         times, chunks, offsets = [], [], []
         for number, chunk in enumerate(self.summary.chunk_indexes):
-            place = chunk.message_index_offsets.get(channel)
-            if place is None:
-                continue
-            opcode, length, _, size = struct.unpack("<BQHI", self._exactly(place, 15))
-            if opcode != Opcode.MESSAGE_INDEX or size != length - 6 or size % 16:
-                raise ValueError("a message index record is malformed")
-            table = np.frombuffer(self._exactly(place + 15, size), dtype="<u8").reshape(-1, 2)
-            times.append(table[:, 0].astype(np.int64))
-            offsets.append(table[:, 1].astype(np.int64))
-            chunks.append(np.full(len(table), number, dtype=np.int64))
+            for place in (p for c, p in chunk.message_index_offsets.items() if c in channels):
+                table = self._message_index(place, chunk.uncompressed_size)
+                times.append(table[:, 0])
+                offsets.append(table[:, 1])
+                chunks.append(np.full(len(table), number, dtype=np.int64))
         if not times:
             return TopicIndex.empty()
         joined = np.concatenate(times)
         order = np.argsort(joined, kind="stable")
         return TopicIndex(joined[order], np.concatenate(chunks)[order], np.concatenate(offsets)[order])
 
+    def _message_index(self, place: int, chunk_size: int) -> Int64[Array, "n 2"]:
+        """Log time and offset of each message."""
+        opcode, length, _, size = struct.unpack("<BQHI", self._exactly(place, 15))
+        if opcode != Opcode.MESSAGE_INDEX or size != length - 6 or size % 16:
+            raise ValueError("a message index record is malformed")
+        table = np.frombuffer(self._exactly(place + 15, size), dtype="<i8").reshape(-1, 2)
+        if len(table) and (table.min() < 0 or table[:, 1].max() + _MESSAGE_HEAD.size > chunk_size):
+            raise ValueError("a message index points out of its chunk")
+        return table
+
     def _record(self, offset: int, kind: type[T]) -> T:
         length = struct.unpack("<Q", self._exactly(offset + 1, 8))[0]
         data = self._exactly(offset, 9 + length)
-        for record in StreamReader(io.BytesIO(data), skip_magic=True, validate_crcs=True).records:
+        if (
+            kind is Attachment
+            and data[-4:] != bytes(4)
+            and zlib.crc32(data[9:-4]) != int.from_bytes(data[-4:], "little")
+        ):
+            raise ValueError("its CRC differs")
+        for record in StreamReader(io.BytesIO(data), skip_magic=True).records:
             if isinstance(record, kind):
                 return record
             break
@@ -243,18 +276,22 @@ class McapFile:
             raise ValueError("the chunk's CRC differs")
         return data
 
-    def _head(self, number: int, offset: int) -> tuple[int, ...]:
+    def _publish_time(self, number: int, offset: int) -> int:
         chunk, place = self._chunk_place(number)
         if chunk.compression:
-            return _MESSAGE_HEAD.unpack_from(self._chunk(number), offset)
-        if offset + _MESSAGE_HEAD.size > chunk.uncompressed_size:
+            head = _MESSAGE_HEAD.unpack_from(self._chunk(number), offset)
+        elif offset + _MESSAGE_HEAD.size > chunk.uncompressed_size:
             raise ValueError("a message lies outside its chunk")
-        return _MESSAGE_HEAD.unpack(self._exactly(place + offset, _MESSAGE_HEAD.size))
+        else:
+            head = _MESSAGE_HEAD.unpack(self._exactly(place + offset, _MESSAGE_HEAD.size))
+        if head[0] != Opcode.MESSAGE or not 0 <= head[5] < LATEST_NS:
+            raise ValueError(f"opcode {head[0]}, time {head[5]}")
+        return int(head[5])
 
     def _cut(self, topic: str, chunk: bytes, offset: int) -> Message:
         opcode, length, channel, sequence, log_ns, publish_ns = _MESSAGE_HEAD.unpack_from(chunk, offset)
         end = offset + 9 + length
-        if opcode != Opcode.MESSAGE or channel != self.channels[topic].id or end > len(chunk) or length < 22:
+        if opcode != Opcode.MESSAGE or channel not in self._ids[topic] or end > len(chunk) or length < 22:
             raise ValueError("its index points to something else")
         return Message(topic, sequence, log_ns, publish_ns, chunk[offset + _MESSAGE_HEAD.size : end])
 

@@ -1,13 +1,12 @@
 """An MCAP file that can be cut off at any byte: small chunks, errors that stay, fsync from another thread.
 
-The record layouts are those of the `mcap` package; what is our own is when a chunk is closed (1 MiB or 250 ms), that
-chunks of messages that were compressed already stay uncompressed, and that a refused write is never forgotten.
+The record layouts are those of the `mcap` package. What is our own: when a chunk is closed (1 MiB or 250 ms), that it
+repeats the schemas and channels of its messages (so each chunk can be read when all others are lost), that chunks of
+messages that were compressed already stay uncompressed, and that a refused write is never forgotten.
 """
 
 from __future__ import annotations
 
-import hashlib
-import os
 import struct
 import threading
 import time
@@ -36,65 +35,17 @@ from mcap.records import (
 )
 
 from recordings.errors import BadInput, WriteFailed
+from recordings.mcap_sink import Sink
 
 MAGIC = b"\x89MCAP0\r\n"
 CHUNK_BYTES = 1 << 20
 CHUNK_NS = 250_000_000
+LATEST_NS = 1 << 63
 SYNC_EVERY_S = 1.0
 WATCH_EVERY_S = 0.05
 _MESSAGE_HEAD = struct.Struct("<BQHIQQ")
 _CHUNK_HEAD = struct.Struct("<BQQQQI")
 _FOOTER_HEAD = struct.Struct("<BQQQ")
-
-
-class _Sink:
-    """An append-only file: counts, hashes and checksums what it wrote, and keeps the first error for ever."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self.position = 0
-        self.sha256 = hashlib.sha256()
-        self.crc = 0
-        self.error: OSError | None = None
-        try:
-            self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644)
-        except FileExistsError as there:
-            raise BadInput(f"{path} exists already; nothing was written. Choose another name or remove it") from there
-        except OSError as refused:
-            raise WriteFailed(f"{path} cannot be created: {refused.strerror}") from refused
-
-    def write(self, *parts: bytes | bytearray | memoryview) -> None:
-        self.check()
-        try:
-            for part in parts:
-                view = memoryview(part)
-                while len(view):
-                    view = view[os.write(self._file, view) :]
-                self.position += len(part)
-                self.sha256.update(part)
-                self.crc = zlib.crc32(part, self.crc)
-        except OSError as refused:
-            self.error = refused
-            self.check()
-
-    def check(self) -> None:
-        if self.error is not None:
-            raise WriteFailed(
-                f"{self.path}: the disk refused a write ({self.error.strerror}) after {self.position} bytes; "
-                "what was complete before is kept: `toss-session recover` reads it"
-            ) from self.error
-
-    def sync(self) -> None:
-        try:
-            os.fsync(self._file)
-        except OSError as refused:
-            self.error = self.error or refused
-
-    def close(self) -> None:
-        try:
-            os.close(self._file)
-        except OSError as refused:
-            self.error = self.error or refused
 
 
 class McapWriter:
@@ -105,18 +56,17 @@ class McapWriter:
 
     def __init__(self, path: Path, profile: str = "tosslab", library: str = "tosslab") -> None:
         self._lock = threading.RLock()
-        self._sink = _Sink(path)
+        self._sink = Sink(path)
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, Channel] = {}
-        self._counts: dict[int, int] = {}
+        self._definitions: dict[int, bytes] = {}
+        self._accepted: dict[int, int] = {}
+        self._kept: dict[int, int] = {}
         self._chunk = _Chunk()
         self._chunk_indexes: list[ChunkIndex] = []
         self._attachments: list[AttachmentIndex] = []
         self._metadata: list[MetadataIndex] = []
-        self._first_ns: int | None = None
-        self._last_ns = 0
         self._compressor = zstandard.ZstdCompressor(level=1)
-        self._finished = False
         self._stop = threading.Event()
         self._write_records(MAGIC, Header(profile, library))
         self._watcher = threading.Thread(target=self._watch, name=f"sync {path.name}", daemon=True)
@@ -132,7 +82,13 @@ class McapWriter:
     def counts(self) -> dict[str, int]:
         """Messages accepted so far, by topic."""
         with self._lock:
-            return {self._channels[i].topic: n for i, n in self._counts.items()}
+            return {self._channels[i].topic: n for i, n in self._accepted.items()}
+
+    @property
+    def kept(self) -> dict[str, int]:
+        """Messages in the chunks that the disk took, by topic."""
+        with self._lock:
+            return {self._channels[i].topic: n for i, n in self._kept.items()}
 
     @property
     def bytes_written(self) -> int:
@@ -142,33 +98,47 @@ class McapWriter:
         with self._lock:
             number = len(self._schemas) + 1
             self._schemas[number] = Schema(id=number, name=name, encoding=encoding, data=data)
-            self._chunk.add_record(self._schemas[number])
             return number
 
     def channel(self, topic: str, message_encoding: str, schema: int, metadata: Mapping[str, str] | None = None) -> int:
+        """A new channel; `schema` 0 means that its messages have none."""
         with self._lock:
             number = len(self._channels) + 1
-            self._channels[number] = Channel(
+            channel = Channel(
                 id=number,
                 topic=topic,
                 message_encoding=message_encoding,
                 schema_id=schema,
                 metadata=dict(metadata or {}),
             )
-            self._counts[number] = 0
-            self._chunk.add_record(self._channels[number])
+            self._channels[number] = channel
+            self._definitions[number] = (_serialized(self._schemas[schema]) if schema else b"") + _serialized(channel)
+            self._accepted[number] = self._kept[number] = 0
             return number
 
     def message(
-        self, channel: int, log_time_ns: int, publish_time_ns: int, sequence: int, data: bytes, *, compress: bool = False
+        self,
+        channel: int,
+        log_time_ns: int,
+        publish_time_ns: int,
+        sequence: int,
+        data: bytes,
+        *,
+        compress: bool = False,
     ) -> None:
-        """Append one message. `compress`: its bytes gain from zstd (raw images), so its chunk is compressed."""
+        """Append one message. `compress`: its bytes gain from zstd (raw images), so its chunk is compressed.
+
+        Raises BadInput for a time that no file can hold (before 0 or beyond 63 bits).
+        """
+        if not (0 <= log_time_ns < LATEST_NS and 0 <= publish_time_ns < LATEST_NS):
+            topic = self._channels[channel].topic
+            raise BadInput(f"{topic}: times {log_time_ns} and {publish_time_ns} ns; wanted 0 to {LATEST_NS - 1}")
         with self._lock:
             self._sink.check()
+            if channel not in self._chunk.index:
+                self._chunk.add_definition(self._definitions[channel])
             self._chunk.add_message(channel, log_time_ns, publish_time_ns, sequence & 0xFFFFFFFF, data, compress)
-            self._counts[channel] += 1
-            self._first_ns = log_time_ns if self._first_ns is None else min(self._first_ns, log_time_ns)
-            self._last_ns = max(self._last_ns, log_time_ns)
+            self._accepted[channel] += 1
             if self._chunk.full():
                 self._close_chunk()
 
@@ -197,33 +167,38 @@ class McapWriter:
 
     def finish(self) -> str:
         """Close the file with its summary, sync it and return its sha256 as hex. Raises a latched WriteFailed."""
-        with self._lock:
-            self._close_chunk()
-            self._write_records(DataEnd(self._sink.crc))
-            self._write_summary()
-            self._finished = True
+        try:
+            with self._lock:
+                self._sink.check()
+                self._close_chunk()
+                self._write_records(DataEnd(self._sink.crc))
+                self._write_summary()
+                self._stop.set()
+        except WriteFailed:
+            self.abandon()
+            raise
         self._end_watch()
         self._sink.sync()
         self._sink.close()
-        self._sink.check()
-        return self._sink.sha256.hexdigest()
+        self._sink.raise_latched()
+        return self._sink.sha256
 
     def abandon(self) -> None:
         """Stop without a summary: what was accepted is flushed, and `toss-session recover` reads the file. Never raises."""
-        if self._finished or self._stop.is_set():
-            self._end_watch()
+        if self._stop.is_set():
             return
         with self._lock:
             try:
                 self._close_chunk()
             except WriteFailed:
                 pass  # latched in the sink; every later call says so again
+            self._stop.set()
         self._end_watch()
         self._sink.sync()
         self._sink.close()
-        self._sink.error = self._sink.error or OSError(0, "the file was abandoned")
 
     def _end_watch(self) -> None:
+        """Never called with the lock held: the watcher may be waiting for it."""
         self._stop.set()
         if threading.current_thread() is not self._watcher:
             self._watcher.join()
@@ -233,7 +208,7 @@ class McapWriter:
         synced_s = time.monotonic()
         while not self._stop.wait(WATCH_EVERY_S):
             with self._lock:
-                if self._finished or self._sink.error is not None:
+                if self._stop.is_set() or self._sink.error is not None:
                     continue
                 if self._chunk.old():
                     try:
@@ -262,6 +237,7 @@ class McapWriter:
         for channel, records in chunk.index.items():
             offsets[channel] = end + index_bytes.count
             MessageIndex(channel_id=channel, records=records).write(index_bytes)
+            self._kept[channel] += len(records)
         self._sink.write(index_bytes.end())
         self._chunk_indexes.append(
             ChunkIndex(
@@ -284,9 +260,7 @@ class McapWriter:
             if isinstance(record, bytes):
                 self._sink.write(record)
                 continue
-            builder = RecordBuilder()
-            record.write(builder)
-            self._sink.write(builder.end())
+            self._sink.write(_serialized(record))
         return offset, self._sink.position - offset
 
     def _write_summary(self) -> None:
@@ -319,11 +293,11 @@ class McapWriter:
         return Statistics(
             attachment_count=len(self._attachments),
             channel_count=len(self._channels),
-            channel_message_counts=dict(self._counts),
+            channel_message_counts=dict(self._kept),
             chunk_count=len(self._chunk_indexes),
-            message_count=sum(self._counts.values()),
-            message_end_time=self._last_ns,
-            message_start_time=self._first_ns or 0,
+            message_count=sum(self._kept.values()),
+            message_end_time=max((c.message_end_time for c in self._chunk_indexes), default=0),
+            message_start_time=min((c.message_start_time for c in self._chunk_indexes), default=0),
             metadata_count=len(self._metadata),
             schema_count=len(self._schemas),
         )
@@ -341,10 +315,8 @@ class _Chunk:
         self.compress = False
         self.opened_s = time.monotonic()
 
-    def add_record(self, record: McapRecord) -> None:
-        builder = RecordBuilder()
-        record.write(builder)
-        self._append(builder.end())
+    def add_definition(self, record: bytes) -> None:
+        self._append(record)
 
     def add_message(
         self, channel: int, log_ns: int, publish_ns: int, sequence: int, data: bytes, compress: bool
@@ -368,3 +340,9 @@ class _Chunk:
 
     def old(self) -> bool:
         return self.size > 0 and time.monotonic() - self.opened_s >= CHUNK_NS / 1e9
+
+
+def _serialized(record: McapRecord) -> bytes:
+    builder = RecordBuilder()
+    record.write(builder)
+    return builder.end()

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int64
 from numpy import ndarray as Array
 
-from recordings import codec, sync
+from recordings import arm_codec, codec, sync
 from recordings.align import align_depth
 from recordings.errors import BadInput, DamagedFile
 from recordings.geometry import CameraModel
@@ -140,7 +140,9 @@ class Toss:
     def depth(self, camera: str = "d455") -> Frames[DepthImage]:
         topic = f"/{camera}/depth"
         if topic not in self.file.channels:
-            return Frames(np.zeros(0, dtype=np.int64), lambda i: codec.read_depth(self.file.read(topic, i), camera, "", 0))
+            return Frames(
+                np.zeros(0, dtype=np.int64), lambda i: codec.read_depth(self.file.read(topic, i), camera, "", 0)
+            )
         unit_m = float(self.file.channels[topic].metadata.get("unit_m", 0.001))
         schema = self._schema(topic)
         times_ns = self.file.publish_times_ns(topic)
@@ -183,8 +185,8 @@ class Toss:
         return found
 
     def arm_states(self) -> ArmStates | None:
-        messages = list(self.file.messages("/arm/joint_states"))
-        return codec.read_arm(messages) if messages else None
+        messages = [m.data for m in self.file.messages(arm_codec.TOPIC)]
+        return arm_codec.read_arm(messages) if messages else None
 
     def events(self) -> tuple[TossEvent, ...]:
         return tuple(codec.read_event(m) for m in self.file.messages("/toss/event"))
@@ -212,14 +214,17 @@ class Toss:
 
     def _images(self, topic: str, camera: str) -> Frames[EncodedImage]:
         if topic not in self.file.channels:
-            return Frames(np.zeros(0, dtype=np.int64), lambda i: codec.read_image(self.file.read(topic, i), camera, "", (0, 0)))
+            return Frames(
+                np.zeros(0, dtype=np.int64), lambda i: codec.read_image(self.file.read(topic, i), camera, "", (0, 0))
+            )
         metadata, schema = self.file.channels[topic].metadata, self._schema(topic)
         try:
             size = (int(metadata["width"]), int(metadata["height"]))
         except (KeyError, ValueError) as wrong:
             raise DamagedFile(f"{self.path}: {topic} does not say its image size") from wrong
         return Frames(
-            self.file.publish_times_ns(topic), lambda i: codec.read_image(self.file.read(topic, i), camera, schema, size)
+            self.file.publish_times_ns(topic),
+            lambda i: codec.read_image(self.file.read(topic, i), camera, schema, size),
         )
 
     def _schema(self, topic: str) -> str:
@@ -296,7 +301,9 @@ def _open_folder(path: Path) -> Session:
             files[int(file.stem[5:])] = file
     document_path = path / "session.json"
     if not document_path.exists():
-        hint = " It looks like the folder layout: `toss-session import folder`." if list(path.glob("toss_*/rgb")) else ""
+        hint = (
+            " It looks like the folder layout: `toss-session import folder`." if list(path.glob("toss_*/rgb")) else ""
+        )
         raise BadInput(f"{path} has no session.json, so it is no session.{hint}")
     document = read_document(document_path)
     calibration_path = path / "calibration.json"
@@ -313,7 +320,10 @@ def _open_file(path: Path) -> Session:
     document = _parse_document(attached, f"{path}: session.json") if attached else {}
     stop = toss.file.metadata("tosslab.stop")
     streams = _parse_json(stop[-1].get("streams", "{}"), f"{path}: its counts") if stop else {}
-    document = {**document, "stop": {"status": stop[-1].get("status", "") if stop else "", "streams": {path.stem: streams}}}
+    document = {
+        **document,
+        "stop": {"status": stop[-1].get("status", "") if stop else "", "streams": {path.stem: streams}},
+    }
     session = Session(path, document, toss.calibration, {toss.index: path})
     session._open[toss.index] = toss
     return session

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import time
@@ -11,10 +12,11 @@ from typing import Any
 
 import numpy as np
 from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
+from foxglove_schemas_protobuf.JointStates_pb2 import JointStates
 from jaxtyping import Bool
 from numpy import ndarray as Array
 
-from recordings import codec
+from recordings import arm_codec, codec
 from recordings.errors import BadInput, WriteFailed
 from recordings.geometry import Transform
 from recordings.mcap_writer import McapWriter
@@ -43,21 +45,25 @@ class TossWriter:
         self._schemas: dict[type, int] = {}
         self._sizes: dict[str, tuple[int, int]] = {}
         self._dropped: dict[str, int] = {}
+        self._arm_samples = 0
+        self._ended = False
         self._begun = False
         self._writer.metadata(
             "tosslab", {"format_version": str(FORMAT_VERSION), "kind": kind, "info": json.dumps(dict(info))}
         )
-        self._writer.attachment("session.json", "application/json", _json_bytes({"format_version": FORMAT_VERSION, "start": start}))
+        self._writer.attachment(
+            "session.json", "application/json", _json_bytes({"format_version": FORMAT_VERSION, "start": start})
+        )
         self._writer.attachment("calibration.json", "application/json", _json_bytes(calibration.to_json()))
 
     def __enter__(self) -> TossWriter:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *exc: object) -> None:
-        if kind is None and self.sha256 is None:
+        if kind is not None:
+            self.abandon()
+        elif self.sha256 is None:
             self.finish()
-        else:
-            self._writer.abandon()
 
     def color(self, image: EncodedImage) -> None:
         self._image(f"/{image.camera}/color", image)
@@ -67,7 +73,9 @@ class TossWriter:
 
     def depth(self, image: DepthImage) -> None:
         if image.raw.dtype != np.uint16 or not 0 < image.unit_m < 1:
-            raise BadInput(f"{image.camera} depth {image.index}: wanted uint16 with a unit in metres, found {image.raw.dtype}, {image.unit_m}")
+            raise BadInput(
+                f"{image.camera} depth {image.index}: wanted uint16 with a unit in metres, found {image.raw.dtype}, {image.unit_m}"
+            )
         topic = f"/{image.camera}/depth"
         height, width = image.raw.shape
         self._same_size(topic, width, height)
@@ -75,8 +83,14 @@ class TossWriter:
         self._put(topic, payload, image.host_time_ns, image.time_ns, image.index, {"unit_m": repr(image.unit_m)})
 
     def arm(self, states: ArmStates) -> None:
-        for i, time_ns in enumerate(states.time_ns):
-            self._put("/arm/joint_states", codec.encode_arm(states, i), int(time_ns), int(time_ns), i)
+        """A batch of samples, as the arm's driver delivers them; `sequence` counts on over the batches of the toss."""
+        if len(states.time_ns) == 0:
+            return
+        self._begin(int(states.time_ns[0]))
+        channel = self._channel(arm_codec.TOPIC, JointStates, None)
+        for time_ns, data in zip(states.time_ns.tolist(), arm_codec.encode_arm(states), strict=True):
+            self._writer.message(channel, time_ns, time_ns, self._arm_samples, data)
+            self._arm_samples += 1
 
     def command(self, command: TossCommand) -> None:
         self._put("/toss/command", codec.encode_command(command), command.time_ns, command.time_ns, 0)
@@ -101,22 +115,34 @@ class TossWriter:
         self._dropped[topic] = self._dropped.get(topic, 0) + count
 
     def streams(self) -> dict[str, dict[str, int]]:
-        """Received, written and dropped by topic, for the stop document."""
-        written = self._writer.counts
+        """Received, written and dropped by topic, for the stop document. `written` lies in chunks that the disk took."""
+        accepted, kept = self._writer.counts, self._writer.kept if self._ended else self._writer.counts
         return {
             topic: {
-                "received": written.get(topic, 0) + self._dropped.get(topic, 0),
-                "written": written.get(topic, 0),
-                "dropped": self._dropped.get(topic, 0),
+                "received": accepted.get(topic, 0) + self._dropped.get(topic, 0),
+                "written": kept.get(topic, 0),
+                "dropped": self._dropped.get(topic, 0) + accepted.get(topic, 0) - kept.get(topic, 0),
             }
-            for topic in sorted({*written, *self._dropped})
+            for topic in sorted({*accepted, *self._dropped})
         }
 
+    def abandon(self) -> None:
+        """Leave the file without its end: `toss-session recover` reads it. Never raises."""
+        self._ended = True
+        self._writer.abandon()
+
     def finish(self) -> str:
-        """Write counts and index, close, return the file's sha256."""
-        self._begin(0)
-        self._writer.metadata("tosslab.stop", {"status": "complete", "streams": json.dumps(self.streams())})
-        self.sha256 = self._writer.finish()
+        """Write counts and index, close, return the file's sha256. Raises WriteFailed and keeps what the disk took."""
+        if self.sha256 is not None:
+            return self.sha256
+        try:
+            self._begin(0)
+            self._writer.metadata("tosslab.stop", {"status": "complete", "streams": json.dumps(self.streams())})
+            self.sha256 = self._writer.finish()
+        except WriteFailed:
+            self.abandon()
+            raise
+        self._ended = True
         return self.sha256
 
     def _image(self, topic: str, image: EncodedImage) -> None:
@@ -127,7 +153,9 @@ class TossWriter:
     def _same_size(self, topic: str, width: int, height: int) -> None:
         first = self._sizes.setdefault(topic, (width, height))
         if first != (width, height):
-            raise BadInput(f"{topic}: an image of {width}x{height} after images of {first[0]}x{first[1]}; one size per toss")
+            raise BadInput(
+                f"{topic}: an image of {width}x{height} after images of {first[0]}x{first[1]}; one size per toss"
+            )
 
     def _put(
         self,
@@ -150,7 +178,9 @@ class TossWriter:
             self._channels[topic] = (self._writer.channel(topic, "protobuf", self._schemas[schema], metadata), schema)
         number, first = self._channels[topic]
         if first is not schema:
-            raise BadInput(f"{topic}: {schema.DESCRIPTOR.full_name} after {first.DESCRIPTOR.full_name}; one encoding per toss")  # type: ignore[attr-defined]
+            raise BadInput(
+                f"{topic}: {schema.DESCRIPTOR.full_name} after {first.DESCRIPTOR.full_name}; one encoding per toss"
+            )  # type: ignore[attr-defined]
         return number
 
     def _begin(self, time_ns: int) -> None:
@@ -160,7 +190,9 @@ class TossWriter:
         self._begun = True
         transforms = list(self._calibration.transforms)
         for name, camera in self._calibration.cameras.items():
-            topic = f"/{name[: -len('_depth')]}/depth_calibration" if name.endswith("_depth") else f"/{name}/calibration"
+            topic = (
+                f"/{name[: -len('_depth')]}/depth_calibration" if name.endswith("_depth") else f"/{name}/calibration"
+            )
             self._send(topic, CameraCalibration, codec.encode_calibration(camera, time_ns), time_ns)
         if "d455" in self._calibration.cameras and "d455_depth" not in self._calibration.cameras:
             transforms.append(Transform.identity("d455", "d455_depth"))
@@ -195,6 +227,7 @@ class SessionWriter:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, *rest: object) -> None:
         if self._stopped:
             return
+        self._abandon_open_tosses()
         interrupted = kind is None or issubclass(kind, KeyboardInterrupt)
         try:
             self.finish("interrupted" if interrupted else "failed", str(error) if error else "left without finish")
@@ -211,7 +244,11 @@ class SessionWriter:
         return self._file("calibration", "calibration", {})
 
     def finish(self, status: str = "complete", reason: str = "") -> None:
-        """Write the stop document: counts per stream and the sha256 of every finished file."""
+        """Write the stop document: counts per stream and the sha256 of every finished file.
+
+        A toss that is still open is left as it is, recoverable and without a sha256.
+        """
+        self._abandon_open_tosses()
         sha256 = {t.path.name: t.sha256 for t in self._tosses.values() if t.sha256 is not None}
         sha256["calibration.json"] = file_sha256(self.folder / "calibration.json")
         self._write_document(
@@ -226,6 +263,11 @@ class SessionWriter:
         )
         self._stopped = True
 
+    def _abandon_open_tosses(self) -> None:
+        for toss in self._tosses.values():
+            if toss.sha256 is None:
+                toss.abandon()
+
     def _file(self, name: str, kind: str, info: Mapping[str, Any]) -> TossWriter:
         if name in self._tosses:
             raise BadInput(f"{name} was written already in this session; nothing was changed")
@@ -234,9 +276,7 @@ class SessionWriter:
         return writer
 
     def _write_document(self, stop: Mapping[str, Any] | None) -> None:
-        write_json(
-            self.folder / "session.json", {"format_version": FORMAT_VERSION, "start": self.start, "stop": stop}
-        )
+        write_json(self.folder / "session.json", {"format_version": FORMAT_VERSION, "start": self.start, "stop": stop})
 
 
 def write_truth(
@@ -255,7 +295,9 @@ def write_truth(
     _make_folder(folder)
     sha256 = {}
     for toss, track in poses.items():
-        with TossWriter(folder / f"{toss_name(toss)}.mcap", {"truth": dict(info)}, NO_CALIBRATION, "truth", {"toss": toss}) as w:
+        with TossWriter(
+            folder / f"{toss_name(toss)}.mcap", {"truth": dict(info)}, NO_CALIBRATION, "truth", {"toss": toss}
+        ) as w:
             for i, pose in enumerate(track):
                 w.pose("/groundtruth/pose", pose, i)
             sha256[w.path.name] = w.finish()
@@ -281,6 +323,8 @@ def write_bytes(path: Path, data: bytes) -> None:
             os.fsync(out.fileno())
         partial.replace(path)
     except OSError as refused:
+        with contextlib.suppress(OSError):
+            partial.unlink()
         raise WriteFailed(f"{path} could not be written: {refused.strerror}; nothing was changed there") from refused
 
 
