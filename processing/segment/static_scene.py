@@ -1,0 +1,194 @@
+"""The scene without the object: what a camera that stands still sees behind everything that moves."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32
+from numpy import ndarray as Array
+
+from recordings.errors import BadInput
+from recordings.geometry import CameraModel, Transform
+from recordings.records import RgbdFrame
+from recordings.tracks import RigCalibration
+
+
+@dataclass(frozen=True)
+class SceneSettings:
+    """How the static scene is learned."""
+
+    frames: int = 48
+    """Frames sampled evenly over the session."""
+    far_share: float = 0.85
+    """The scene lies at this quantile of the depths seen by a pixel: things in front of it come and go."""
+    seen_share: float = 0.4
+    """A pixel whose depth agrees with the scene in fewer frames has no scene depth."""
+    still_share: float = 0.5
+    """The camera moved when fewer of the pixels agree with the scene in the median frame."""
+
+
+@dataclass(frozen=True, eq=False)
+class StaticScene:
+    """Depth (0 where the scene gives no return) and colour of the empty scene, with their noise.
+
+    `known` marks pixels whose colour is the scene's; `table_depth_m` is the depth of the table plane along each pixel's
+    ray (0 where the ray does not meet it, or no plane is known).
+    """
+
+    depth_m: Float32[Array, "h w"]
+    depth_sigma_m: Float32[Array, "h w"]
+    color_rgb: Float32[Array, "h w 3"]
+    color_sigma: Float32[Array, "h w"]
+    known: Bool[Array, "h w"]
+    table_depth_m: Float32[Array, "h w"]
+
+
+def stereo_sigma_m(depth_m: Float32[Array, "*n"]) -> Float32[Array, "*n"]:
+    """Noise of active stereo depth: it grows with the square of the distance (0.08 px of disparity: 2.3 mm at 1 m)."""
+    return np.float32(0.0025) * depth_m * depth_m
+
+
+def sample_positions(counts: Sequence[int], wanted: int) -> list[tuple[int, int]]:
+    """(position in `counts`, frame position), spread evenly over all tosses, each with its first and last frame."""
+    each = max(2, wanted // max(1, len(counts)))
+    chosen: list[tuple[int, int]] = []
+    for i, count in enumerate(counts):
+        if count:
+            chosen += [(i, int(p)) for p in np.unique(np.linspace(0, count - 1, min(each, count)).round())]
+    return chosen
+
+
+def learn_scene(
+    frames: Iterable[RgbdFrame], table_depth_m: Float32[Array, "h w"] | None, settings: SceneSettings
+) -> StaticScene:
+    """Learn the scene from frames spread over the session. Raises BadInput where the camera moved between them."""
+    colors, depths = [], []
+    for frame in frames:
+        colors.append(frame.color_rgb)
+        depths.append(frame.depth_m)
+    if not colors:
+        raise BadInput("no frame to learn the static scene from; wanted a session with colour and depth of d455")
+    if len({c.shape for c in colors}) > 1:
+        raise BadInput(f"the images change their size within the session: {sorted({c.shape for c in colors})}")
+    height, width = depths[0].shape
+    table = np.zeros((height, width), dtype=np.float32) if table_depth_m is None else table_depth_m
+    rows = [
+        _learn_rows([c[i : i + 40] for c in colors], [d[i : i + 40] for d in depths], settings)
+        for i in range(0, height, 40)
+    ]
+    depth, sigma, agrees, color, color_sigma = (np.concatenate(part) for part in zip(*rows))
+    still = float(np.median(agrees[depth > 0])) if (depth > 0).any() else 1.0
+    if still < settings.still_share:
+        raise BadInput(
+            f"only {100 * still:.0f} % of the frames agree with a static scene; this camera seems to move. "
+            "Masks need a camera that stands still: record from a fixed one"
+        )
+    return StaticScene(depth, sigma, color, color_sigma, np.ones((height, width), dtype=bool), table)
+
+
+def _learn_rows(
+    colors: Sequence[Array], depths: Sequence[Array], settings: SceneSettings
+) -> tuple[Array, Array, Array, Array, Array]:
+    """Scene depth, its noise, the share of agreeing frames, scene colour and its noise, for some image rows."""
+    z = np.stack(depths)
+    seen = z > 0
+    count = seen.sum(0)
+    ordered = np.sort(z, axis=0)  # zeros come first
+    at = np.clip(len(z) - count + (settings.far_share * (count - 1)).astype(int), 0, len(z) - 1)
+    far = np.take_along_axis(ordered, at[None], 0)[0]
+    agrees = seen & (np.abs(z - far) < np.maximum(0.006, 5 * stereo_sigma_m(far)))
+    share = agrees.mean(0)
+    depth = _masked_median(z, agrees)
+    sigma = 1.48 * _masked_median(np.abs(z - depth), agrees)
+    empty = agrees | (~seen & (share < settings.seen_share)[None])
+    color, color_sigma = _color_median(np.stack(colors), empty)
+    valid = share >= settings.seen_share
+    depth, sigma = np.where(valid, depth, 0), np.where(valid, sigma, 0)
+    return depth.astype(np.float32), sigma.astype(np.float32), share, color, color_sigma
+
+
+def _color_median(colors: Array, empty: Bool[Array, "n h w"]) -> tuple[Float32[Array, "h w 3"], Float32[Array, "h w"]]:
+    """Median colour over the frames in which a pixel shows the scene (over all, where it never does), and its noise."""
+    use = empty | ~empty.any(0)[None]
+    color = np.stack([_masked_median(colors[..., k].astype(np.float32), use) for k in range(3)], -1)
+    spread = np.abs(colors.astype(np.float32) - color).max(-1)
+    return color, (1.48 * _masked_median(spread, use)).astype(np.float32)
+
+
+def _masked_median(values: Array, use: Bool[Array, "n h w"]) -> Float32[Array, "h w"]:
+    """Lower median over the first axis of the values in use; 0 where none is."""
+    ordered = np.sort(np.where(use, values, np.inf).astype(np.float32), axis=0)
+    middle = np.maximum(use.sum(0) - 1, 0) // 2
+    median = np.take_along_axis(ordered, middle[None], 0)[0]
+    return np.where(np.isfinite(median), median, 0).astype(np.float32)
+
+
+def calibrated_table_depth(calibration: RigCalibration, camera: str) -> Float32[Array, "h w"] | None:
+    """Depth of the plane z = 0 of the world along every pixel's ray; None where the camera's place is not known."""
+    model = calibration.cameras.get(camera)
+    world_from_camera = calibration.find("world", model.frame) if model is not None else None
+    if model is None or world_from_camera is None:
+        return None
+    return plane_depth(model, *plane_in_camera(world_from_camera))
+
+
+def plane_in_camera(world_from_camera: Transform) -> tuple[Float[Array, "3"], float]:
+    """The plane z = 0 of the world as n . x = offset in the camera frame."""
+    return world_from_camera.rotation[2], -float(world_from_camera.translation_m[2])
+
+
+def plane_depth(camera: CameraModel, normal: Float[Array, "3"], offset_m: float) -> Float32[Array, "h w"]:
+    """Depth at which each pixel's ray meets the plane n . x = offset; 0 where it does not within 10 m."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        depth = offset_m / (camera.pixel_rays() @ normal)
+    return np.where(np.isfinite(depth) & (depth > 0) & (depth < 10), depth, 0).astype(np.float32)
+
+
+def fit_plane(
+    points_m: Float[Array, "n 3"], tolerance_m: float, tries: int = 200
+) -> tuple[Float[Array, "3"], float] | None:
+    """The plane n . x = offset that most points lie on (RANSAC, then least squares); None without a clear one."""
+    if len(points_m) < 50:
+        return None
+    rng = np.random.default_rng(0)
+    best = np.zeros(0, dtype=np.int64)
+    for _ in range(tries):
+        a, b, c = points_m[rng.choice(len(points_m), 3, replace=False)]
+        normal = np.cross(b - a, c - a)
+        length = float(np.linalg.norm(normal))
+        if length < 1e-9:
+            continue
+        inside = np.flatnonzero(np.abs((points_m - a) @ (normal / length)) < tolerance_m)
+        best = inside if len(inside) > len(best) else best
+    if len(best) < 0.3 * len(points_m):
+        return None
+    center = points_m[best].mean(0)
+    normal = np.linalg.svd(points_m[best] - center, full_matrices=False)[2][2]
+    return normal, float(normal @ center)
+
+
+def with_object_removed(
+    scene: StaticScene, frame: RgbdFrame, mask: Bool[Array, "h w"], camera: CameraModel | None
+) -> StaticScene:
+    """The scene where the object hardly moves, so that it was learned as a part of it.
+
+    Around the mask, what stands above the table is no longer scene: its depth becomes the table's, its colour unknown.
+    Without a calibrated table, the plane that the mask's surroundings lie on serves.
+    """
+    import cv2
+
+    side = int(np.ceil(np.sqrt(mask.sum())))
+    around = cv2.dilate(mask.astype(np.uint8), np.ones((2 * side + 1, 2 * side + 1), np.uint8)) > 0
+    table = scene.table_depth_m
+    if not table.any() and camera is not None:
+        ring = around & ~mask & (frame.depth_m > 0)
+        v, u = np.nonzero(ring)
+        points = camera.back_project(np.stack([u, v], -1).astype(np.float64), frame.depth_m[ring])
+        plane = fit_plane(points[:: max(1, len(points) // 4000)], 0.008)
+        table = table if plane is None else plane_depth(camera, *plane)
+    stands = around & (table > 0) & (table - scene.depth_m > np.maximum(0.008, 4 * stereo_sigma_m(table)))
+    stands = cv2.dilate((stands | mask).astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
+    depth = np.where(stands, table, scene.depth_m).astype(np.float32)
+    return replace(scene, depth_m=depth, known=scene.known & ~stands, table_depth_m=table)
