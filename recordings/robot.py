@@ -1,0 +1,212 @@
+"""A robot arm from its URDF: where its links are for given joint angles, and the meshes that show them.
+
+Plain numpy; the default is the Franka Panda of the package example-robot-data. Finger joints that mimic one another
+are set together: `finger_width_m` is the distance between the finger pads (twice the URDF's finger joint).
+"""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from importlib import metadata
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray as Array
+
+from recordings.errors import BadInput
+from recordings.geometry import Transform, rotation_exp
+
+PANDA_DISTRIBUTION = "example-robot-data"
+PANDA_URDF = "panda_description/urdf/panda.urdf"
+PANDA_TOOL = "panda_hand_tcp"
+
+
+@dataclass(frozen=True, eq=False)
+class Joint:
+    """`parent_from_child` = origin, then a turn about `axis` by q (revolute) or a shift along it (prismatic)."""
+
+    name: str
+    kind: str
+    parent: str
+    child: str
+    origin: Transform
+    axis: Float[Array, "3"]
+    lower: float
+    upper: float
+    fastest: float
+    """Speed limit in rad/s or m/s."""
+
+    def parent_from_child(self, q: float) -> Transform:
+        if self.kind == "revolute":
+            move = Transform(self.child, self.child, rotation_exp(q * self.axis), np.zeros(3))
+        elif self.kind == "prismatic":
+            move = Transform(self.child, self.child, np.eye(3), q * self.axis)
+        else:
+            return self.origin
+        return self.origin @ move
+
+
+@dataclass(frozen=True, eq=False)
+class LinkMesh:
+    """A mesh file that shows (a part of) a link."""
+
+    link: str
+    path: Path
+    link_from_mesh: Transform
+
+
+@dataclass(frozen=True, eq=False)
+class Robot:
+    """A tree of links. `root` is the base; joints come in the URDF's order, parents before children."""
+
+    root: str
+    joints: tuple[Joint, ...]
+    meshes: tuple[LinkMesh, ...]
+
+    @property
+    def arm_joints(self) -> tuple[Joint, ...]:
+        """The joints that turn, from the base to the tool."""
+        return tuple(j for j in self.joints if j.kind == "revolute")
+
+    def links(self, q_rad: Float[Array, " j"], finger_width_m: float = 0.0) -> dict[str, Transform]:
+        """`<root>_from_<link>` of every link; `q_rad` in the order of `arm_joints`."""
+        names = [j.name for j in self.arm_joints]
+        if len(q_rad) != len(names):
+            raise BadInput(f"{len(q_rad)} joint angles for {len(names)} joints ({', '.join(names)})")
+        at: Mapping[str, float] = dict(zip(names, (float(q) for q in q_rad)))
+        found = {self.root: Transform.identity(self.root, self.root)}
+        for joint in self.joints:
+            q = at.get(joint.name, finger_width_m / 2)
+            found[joint.child] = found[joint.parent] @ joint.parent_from_child(q)
+        return found
+
+    def jacobian(self, q_rad: Float[Array, " j"], link: str, point_m: Float[Array, "3"]) -> Float[Array, "6 j"]:
+        """Velocity (3) and angular velocity (3), in the root's axes, of a point fixed to `link`, per joint speed.
+
+        `point_m` is given in the root's frame; joints that do not carry the link have zero columns.
+        """
+        links = self.links(q_rad)
+        carrying = self._chain(link)
+        columns = []
+        for joint in self.arm_joints:
+            if joint.name not in carrying:
+                columns.append(np.zeros(6))
+                continue
+            frame = links[joint.child]
+            axis = frame.rotation @ joint.axis
+            columns.append(np.concatenate([np.cross(axis, point_m - frame.translation_m), axis]))
+        return np.stack(columns, axis=1)
+
+    def _chain(self, link: str) -> set[str]:
+        above = {j.child: j for j in self.joints}
+        names: set[str] = set()
+        while link in above:
+            names.add(above[link].name)
+            link = above[link].parent
+        return names
+
+
+@cache
+def panda() -> Robot:
+    """The Franka Panda with its hand. Frames: root `panda_link0`, tool `panda_hand_tcp`."""
+    return read_urdf(panda_urdf())
+
+
+def panda_urdf() -> Path:
+    """Where the installed package keeps the Panda's URDF."""
+    try:
+        files = metadata.distribution(PANDA_DISTRIBUTION).files or []
+    except metadata.PackageNotFoundError as missing:
+        raise BadInput("the Panda's model is not installed; run `pip install example-robot-data-loaders`") from missing
+    for file in files:
+        if file.as_posix().endswith(PANDA_URDF):
+            return Path(str(file.locate())).resolve()
+    raise BadInput(
+        f"{PANDA_DISTRIBUTION} holds no {PANDA_URDF}; reinstall it: `pip install example-robot-data-loaders`"
+    )
+
+
+def read_urdf(path: Path) -> Robot:
+    """A URDF whose `package://` meshes lie in a folder above it."""
+    try:
+        tree = ET.parse(path).getroot()
+    except (OSError, ET.ParseError) as wrong:
+        raise BadInput(f"{path}: cannot be read as a URDF ({wrong})") from wrong
+    joints = _in_order([_joint(node) for node in tree.findall("joint")])
+    children = {j.child for j in joints}
+    roots = [name for node in tree.findall("link") if (name := node.attrib["name"]) not in children]
+    if len(roots) != 1:
+        raise BadInput(f"{path}: found {len(roots)} links without a parent ({', '.join(roots)}); wanted one base")
+    meshes = [m for node in tree.findall("link") for m in _meshes(node, path)]
+    return Robot(roots[0], tuple(joints), tuple(meshes))
+
+
+def _joint(node: ET.Element) -> Joint:
+    parent, child = (_child(node, what).attrib["link"] for what in ("parent", "child"))
+    axis, limit = node.find("axis"), node.find("limit")
+    bounds = limit.attrib if limit is not None else {}
+    return Joint(
+        node.attrib["name"],
+        node.attrib["type"],
+        parent,
+        child,
+        _origin(node, parent, child),
+        _numbers(axis.attrib["xyz"]) if axis is not None else np.array([1.0, 0.0, 0.0]),
+        float(bounds.get("lower", "-inf")),
+        float(bounds.get("upper", "inf")),
+        float(bounds.get("velocity", "inf")),
+    )
+
+
+def _in_order(joints: list[Joint]) -> list[Joint]:
+    """Parents before children, otherwise as in the file."""
+    ordered: list[Joint] = []
+    known = {j.parent for j in joints} - {j.child for j in joints}
+    while len(ordered) < len(joints):
+        ready = [j for j in joints if j not in ordered and j.parent in known]
+        if not ready:
+            raise BadInput("the URDF's joints form a loop; wanted a tree")
+        ordered += ready
+        known |= {j.child for j in ready}
+    return ordered
+
+
+def _meshes(link: ET.Element, urdf: Path) -> list[LinkMesh]:
+    found = []
+    for visual in link.findall("visual"):
+        mesh = visual.find("geometry/mesh")
+        if mesh is not None:
+            name = link.attrib["name"]
+            found.append(LinkMesh(name, _locate(mesh.attrib["filename"], urdf), _origin(visual, name, "mesh")))
+    return found
+
+
+def _locate(name: str, urdf: Path) -> Path:
+    relative = name.removeprefix("package://").removeprefix("file://")
+    for folder in urdf.parents:
+        if (folder / relative).is_file():
+            return folder / relative
+    raise BadInput(f"{urdf}: mesh {name} is in none of the folders above it")
+
+
+def _origin(node: ET.Element, target: str, source: str) -> Transform:
+    origin = node.find("origin")
+    given = origin.attrib if origin is not None else {}
+    roll, pitch, yaw = _numbers(given.get("rpy", "0 0 0"))
+    turns = [rotation_exp(a * np.eye(3)[k]) for k, a in enumerate((roll, pitch, yaw))]
+    return Transform(target, source, turns[2] @ turns[1] @ turns[0], _numbers(given.get("xyz", "0 0 0")))
+
+
+def _child(node: ET.Element, name: str) -> ET.Element:
+    found = node.find(name)
+    if found is None:
+        raise BadInput(f"URDF: {node.tag} {node.attrib.get('name', '?')} has no {name}")
+    return found
+
+
+def _numbers(text: str) -> Float[Array, "3"]:
+    return np.array([float(v) for v in text.split()])
