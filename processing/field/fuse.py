@@ -1,0 +1,179 @@
+"""Fusing views into a signed-distance grid: the field's warm start, and by itself the classical baseline.
+
+Positive outside, negative inside, metres. Every depth pixel stands for its local plane, so that a slanted surface is
+not biased along the ray (projective distance would be). Curless and Levoy 1996 with point-to-plane distances.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from jaxtyping import Bool, Float, Float32
+from numpy import ndarray as Array
+from scipy import ndimage
+from scipy.spatial import ConvexHull, QhullError
+
+from processing.field.views import FieldView, object_box
+
+
+@dataclass(frozen=True)
+class FuseConfig:
+    voxel_m: float = 0.0015
+    """Edge of a cell; raised where the object is so large that the grid would exceed `most_cells`."""
+    truncation_m: float = 0.008
+    """Half width of the band around a measured surface in which it counts."""
+    most_cells: int = 6_000_000
+    """Largest number of cells of the grid."""
+    border_m: float = 0.012
+    """Empty space kept around the measured points."""
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """A signed-distance grid in the object frame: `sdf_m[i, j, k]` at `origin_m + voxel_m * (i, j, k)`.
+
+    `weight` is 0 where no view saw a surface or free space; `free` marks cells that some ray passed through;
+    `rgb` (0..1) is the mean colour of the surface nearest to a cell, 0 where nothing was seen near it.
+    """
+
+    origin_m: Float[Array, "3"]
+    voxel_m: float
+    truncation_m: float
+    sdf_m: Float32[Array, "a b c"]
+    weight: Float32[Array, "a b c"]
+    free: Bool[Array, "a b c"]
+    rgb: Float32[Array, "a b c 3"]
+
+    def points(self, cells: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
+        return self.origin_m + self.voxel_m * cells
+
+
+def fuse(views: Sequence[FieldView], config: FuseConfig) -> Grid:
+    """Average the views' signed distances on a grid round the object and complete what no view saw.
+
+    Raises BadInput when the views hold too few depth points.
+    """
+    low, high = object_box(views)
+    low, high = low - config.border_m, high + config.border_m
+    voxel_m = max(config.voxel_m, float(np.cbrt(np.prod(high - low) / config.most_cells)))
+    shape = tuple(int(n) for n in np.ceil((high - low) / voxel_m).astype(int) + 1)
+    total = np.zeros(shape, dtype=np.float32)
+    weight = np.zeros(shape, dtype=np.float32)
+    passed = np.zeros(shape, dtype=np.float32)
+    blocked = np.zeros(shape, dtype=np.float32)
+    paint = np.zeros((*shape, 4), dtype=np.float32)
+    for view in views:
+        _integrate(
+            total,
+            weight,
+            passed,
+            blocked,
+            paint,
+            low.astype(np.float32),
+            np.float32(voxel_m),
+            np.float32(config.truncation_m),
+            view.camera_from_object_at_depth.astype(np.float32),
+            view.K.astype(np.float32),
+            view.depth_m,
+            view.plane,
+            view.outside,
+            view.color_rgb,
+        )
+    free = passed > np.maximum(2.0, 0.2 * blocked)
+    sdf_m = np.where(weight > 0, total / np.maximum(weight, 1e-9), 0).astype(np.float32)
+    rgb = paint[..., :3] / np.maximum(paint[..., 3:], 1e-9)
+    return complete(Grid(low, voxel_m, config.truncation_m, sdf_m, weight, free, _spread(rgb, paint[..., 3] > 0)))
+
+
+def _spread(rgb: Float32[Array, "a b c 3"], known: Bool[Array, "a b c"]) -> Float32[Array, "a b c 3"]:
+    """Every cell without a colour takes that of the nearest cell that has one."""
+    if not known.any():
+        return rgb
+    nearest = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
+    return np.ascontiguousarray(rgb[tuple(nearest)])
+
+
+@numba.njit(cache=True, nogil=True, fastmath=True)
+def _integrate(total, weight, passed, blocked, paint, low, voxel, truncation, pose, K, depth, plane, outside, rgb):  # type: ignore[no-untyped-def]
+    """One view into the sums. Cells are walked along the last axis; all lengths in metres."""
+    height, width = depth.shape
+    n0, n1, n2 = total.shape
+    step0, step1, step2 = pose[0, 2] * voxel, pose[1, 2] * voxel, pose[2, 2] * voxel
+    for i in range(n0):
+        a = low[0] + voxel * i
+        for j in range(n1):
+            b = low[1] + voxel * j
+            x = pose[0, 0] * a + pose[0, 1] * b + pose[0, 2] * low[2] + pose[0, 3]
+            y = pose[1, 0] * a + pose[1, 1] * b + pose[1, 2] * low[2] + pose[1, 3]
+            z = pose[2, 0] * a + pose[2, 1] * b + pose[2, 2] * low[2] + pose[2, 3]
+            for k in range(n2):
+                if z > 0.05:
+                    u = int(np.floor(K[0, 0] * x / z + K[0, 2] + np.float32(0.5)))
+                    v = int(np.floor(K[1, 1] * y / z + K[1, 2] + np.float32(0.5)))
+                    if 0 <= u < width and 0 <= v < height:
+                        d = depth[v, u]
+                        if d > 0:
+                            p0, p1, p2 = plane[v, u, 0], plane[v, u, 1], plane[v, u, 2]
+                            length = np.sqrt(p0 * p0 + p1 * p1 + p2 * p2)
+                            distance = (np.float32(1.0) - p0 * x - p1 * y - p2 * z) / length
+                            gap = d - z
+                            if distance > -truncation and gap > -3 * truncation:
+                                ray = np.sqrt(x * x + y * y + z * z)
+                                facing = d / (length * d * ray)
+                                w = facing / (d * d * d * d)
+                                if distance > truncation:
+                                    passed[i, j, k] += 1
+                                    distance = truncation
+                                    w *= np.float32(0.3)
+                                else:
+                                    blocked[i, j, k] += 1
+                                    if distance < 0:
+                                        w *= np.float32(1.0) + distance / truncation
+                                if abs(distance) < np.float32(0.6) * truncation:
+                                    for c in range(3):
+                                        paint[i, j, k, c] += w * facing * rgb[v, u, c] / np.float32(255)
+                                    paint[i, j, k, 3] += w * facing
+                                total[i, j, k] += w * distance
+                                weight[i, j, k] += w
+                        elif outside[v, u]:
+                            passed[i, j, k] += 1
+                x += step0
+                y += step1
+                z += step2
+
+
+def complete(grid: Grid) -> Grid:
+    """Fill what no view saw: solid inside the convex hull of the seen surface, empty outside it or where a ray passed.
+
+    What the object looks like where nobody looked is a guess, and the mesh marks it as unobserved.
+    """
+    seen = (grid.weight > 0) & ~(grid.free & (grid.sdf_m <= 0))
+    surface = np.argwhere((grid.weight > 0) & (np.abs(grid.sdf_m) < grid.voxel_m) & ~grid.free)
+    unseen_inside = inside_hull(grid.sdf_m.shape, surface) & ~seen & ~grid.free
+    solid = np.where(seen, grid.sdf_m < 0, unseen_inside)
+    distance_m = grid.voxel_m * (
+        ndimage.distance_transform_edt(~solid) - ndimage.distance_transform_edt(solid)
+    ).astype(np.float32)
+    distance_m -= np.sign(distance_m) * np.float32(0.5 * grid.voxel_m)
+    near = seen & (np.abs(grid.sdf_m) < 0.999 * grid.truncation_m)
+    sdf_m = np.where(near, grid.sdf_m, distance_m).astype(np.float32)
+    return Grid(grid.origin_m, grid.voxel_m, grid.truncation_m, sdf_m, np.where(seen, grid.weight, 0), grid.free, grid.rgb)
+
+
+def inside_hull(shape: tuple[int, ...], cells: Float[Array, "n 3"]) -> Bool[Array, "a b c"]:
+    """Which cells lie inside the convex hull of given cells (slightly shrunk against outliers)."""
+    if len(cells) < 10:
+        return np.zeros(shape, dtype=bool)
+    try:
+        hull = ConvexHull(cells)
+    except QhullError:
+        return np.zeros(shape, dtype=bool)
+    planes = np.unique(np.round(hull.equations, 6), axis=0)
+    inside = np.ones(shape, dtype=bool)
+    axes = np.ogrid[tuple(slice(0, n) for n in shape)]
+    for a, b, c, offset in planes:
+        inside &= (a * axes[0] + b * axes[1] + c * axes[2] + offset) <= 0
+    return inside

@@ -1,0 +1,218 @@
+"""Training the neural object field on masked RGBD views, with the poses refined jointly.
+
+After BundleSDF (Wen et al. 2023): three regions along each ray (near the surface, free space, rays that pass the
+object), an Eikonal term and a colour term. Two departures: a sample's target distance is measured to the pixel's local
+plane and not along the ray, and the network starts at the fused grid.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy import ndarray as Array
+from torch import Tensor
+
+from processing.field.encoding import EncodingName
+from processing.field.fuse import FuseConfig, Grid, fuse
+from processing.field.network import ObjectField
+from processing.field.poses import PoseConfig, refine_poses
+from processing.field.rays import RayPool, make_pool
+from processing.field.views import FieldView
+from recordings.geometry import nearest_rotation
+from recordings.progress import Progress, Silent
+
+
+@dataclass(frozen=True)
+class FieldConfig:
+    encoding: EncodingName = "dense"
+    """`dense` on a CPU, `hash` where a GPU is."""
+    fuse: FuseConfig = field(default_factory=lambda: FuseConfig(truncation_m=0.005))
+    """The warm start."""
+    steps: int = 150
+    """Optimiser steps."""
+    rays: int = 2048
+    """Object rays a step; a quarter as many rays that pass the object."""
+    near_samples: int = 3
+    """Samples of each ray within the truncation."""
+    learning_rate: float = 1e-3
+    """Adam's, of networks and features; decays to a tenth."""
+    warm_learning_rate: float = 1e-5
+    """Of the warm-start grid, metres a step."""
+    pose_rounds: int = 2
+    """How often the views are fused anew and their poses refined in what came out; 0 keeps the poses."""
+    poses: PoseConfig = field(default_factory=PoseConfig)
+    """The Gauss-Newton refinement of a round."""
+    eikonal_weight: float = 0.02
+    color_weight: float = 0.05
+    free_weight: float = 0.2
+    passing_weight: float = 0.2
+    seed: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class TrainedField:
+    """The field, its warm start, the refined views with the information matrices (n, 6, 6) of their poses, and the
+    loss of every tenth step."""
+
+    field: ObjectField
+    grid: Grid
+    views: tuple[FieldView, ...]
+    pose_information: Float[Array, "n 6 6"]
+    losses: tuple[float, ...]
+
+
+def train_field(
+    views: Sequence[FieldView], config: FieldConfig, device: str = "cpu", progress: Progress | None = None
+) -> TrainedField:
+    """Refine the poses and learn the field of one object. Raises BadInput when the views hold too few depth points.
+
+    Rounds of fusing and Gauss-Newton come first, because they are cheap; the network is trained once, at the end.
+    """
+    progress = progress or Silent()
+    torch.manual_seed(config.seed)
+    pool = make_pool(views).to(device)
+    information = np.zeros((len(views), 6, 6))
+    total = config.pose_rounds + config.steps
+    for done in range(config.pose_rounds):
+        start = ObjectField(fuse(views, config.fuse), config.encoding).to(device)
+        views, information = refined_views(start, views, pool, config.poses)
+        progress.step(done + 1, total, "field: poses")
+    grid = fuse(views, config.fuse)
+    model = ObjectField(grid, config.encoding).to(device)
+    losses = _optimise(model, stack_poses(views, device), pool, config, progress)
+    return TrainedField(model, grid, tuple(views), information, losses)
+
+
+def refined_views(
+    model: ObjectField, views: Sequence[FieldView], pool: RayPool, config: PoseConfig
+) -> tuple[list[FieldView], Float[Array, "n 6 6"]]:
+    """The views with both their poses moved by the correction that the field asks for."""
+    rotation, translation = stack_poses(views, str(pool.depth.device))
+    rotation, translation, information = refine_poses(model, rotation, translation, pool, config)
+    out = []
+    for view, R, t in zip(views, rotation.double().cpu().numpy(), translation.double().cpu().numpy(), strict=True):
+        at_depth = np.eye(4)
+        at_depth[:3, :3], at_depth[:3, 3] = nearest_rotation(R), t
+        old_from_new = np.linalg.inv(view.camera_from_object_at_depth) @ at_depth
+        out.append(view.posed(view.camera_from_object @ old_from_new, at_depth))
+    return out, information.double().cpu().numpy()
+
+
+def _optimise(
+    model: ObjectField, poses: Poses, pool: RayPool, config: FieldConfig, progress: Progress
+) -> tuple[float, ...]:
+    optimiser = torch.optim.Adam(_groups(model, config), betas=(0.9, 0.99))
+    schedule = torch.optim.lr_scheduler.ExponentialLR(optimiser, 0.1 ** (1 / max(config.steps, 1)))
+    losses = []
+    for step in range(config.steps):
+        optimiser.zero_grad(set_to_none=True)
+        loss = total_loss(model, poses, pool, config)
+        loss.backward()  # type: ignore[no-untyped-call]
+        optimiser.step()
+        schedule.step()
+        if step % 10 == 0:
+            losses.append(float(loss.detach()))
+            progress.value("field loss", losses[-1], at=step)
+        progress.step(config.pose_rounds + step + 1, config.pose_rounds + config.steps, "field: network")
+    return tuple(losses)
+
+
+Poses = tuple[Tensor, Tensor]
+"""Rotations (n, 3, 3) and translations (n, 3) of `camera_from_object` at depth exposure."""
+
+
+def stack_poses(views: Sequence[FieldView], device: str) -> Poses:
+    poses = torch.tensor(np.stack([v.camera_from_object_at_depth for v in views]), dtype=torch.float32, device=device)
+    return poses[:, :3, :3], poses[:, :3, 3]
+
+
+def to_object(poses: Poses, in_camera: Tensor, view: Tensor) -> Tensor:
+    """Points (n, 3) of the camera into the object frame, each by its view's pose."""
+    rotation, translation = poses
+    return ((in_camera - translation[view])[:, None, :] @ rotation[view])[:, 0]
+
+
+def total_loss(model: ObjectField, poses: Poses, pool: RayPool, config: FieldConfig) -> Tensor:
+    """The weighted sum over one random batch; each term is mean-square or mean-absolute in units of the truncation."""
+    chosen = torch.randint(len(pool.depth), (config.rays,), device=pool.depth.device)
+    passing = torch.randint(max(len(pool.passing_view), 1), (config.rays // 4,), device=pool.depth.device)
+    surface, points = near_surface_loss(model, poses, pool, chosen, config)
+    free = free_space_loss(model, poses, pool, chosen[: config.rays // 4])
+    loss = surface + config.free_weight * free
+    loss = loss + config.color_weight * color_loss(model, poses, pool, chosen)
+    if len(pool.passing_view):
+        loss = loss + config.passing_weight * passing_loss(model, poses, pool, passing)
+    return loss + config.eikonal_weight * eikonal_loss(model, points[: config.rays // 2].detach())
+
+
+def near_surface_loss(
+    model: ObjectField, poses: Poses, pool: RayPool, chosen: Tensor, config: FieldConfig
+) -> tuple[Tensor, Tensor]:
+    """Huber loss of sdf(x) against x's distance to the pixel's plane, (1 - n . x) / |n|, in units of the truncation."""
+    k = config.near_samples
+    rays = chosen.repeat_interleave(k)
+    direction, depth, plane = pool.direction[rays], pool.depth[rays], pool.plane[rays]
+    along = (torch.rand(len(rays), device=depth.device) * 2 - 1) * model.truncation_m
+    in_camera = direction * (depth + along / direction.norm(dim=-1))[:, None]
+    target = (1 - (plane * in_camera).sum(-1)) / plane.norm(dim=-1)
+    points = to_object(poses, in_camera, pool.view[rays])
+    sdf = model.sdf(points)
+    behind = torch.where(target < 0, 1 + target / model.truncation_m, torch.ones_like(target)).clamp(0.05)
+    sharp = (pool.depth.median() / depth) ** 4
+    gap = (sdf - target) / model.truncation_m
+    return (behind * sharp.clamp(max=4) * torch.nn.functional.huber_loss(gap, torch.zeros_like(gap), reduction="none", delta=0.3)).mean(), points
+
+
+def free_space_loss(model: ObjectField, poses: Poses, pool: RayPool, chosen: Tensor) -> Tensor:
+    """Before the surface the distance is at least the truncation: mean square of what is missing."""
+    direction, depth = pool.direction[chosen], pool.depth[chosen]
+    before = model.truncation_m * (1.5 + 4 * torch.rand(len(chosen), device=depth.device))
+    in_camera = direction * (depth - before / direction.norm(dim=-1))[:, None]
+    plane = pool.plane[chosen]
+    distance = (1 - (plane * in_camera).sum(-1)) / plane.norm(dim=-1)
+    sdf = model.sdf(to_object(poses, in_camera, pool.view[chosen]))
+    wanted = distance.clamp(0, model.truncation_m)
+    return ((wanted - sdf).clamp(min=0) / model.truncation_m).square().mean()
+
+
+def passing_loss(model: ObjectField, poses: Poses, pool: RayPool, chosen: Tensor) -> Tensor:
+    """A ray beside the mask never enters the object: mean square of the depth of the worst of eight samples on it."""
+    view = pool.passing_view[chosen]
+    centre = poses[1][view] + (poses[0][view] @ (model.low + model.size / 2)[:, None])[..., 0]
+    reach = model.size.norm() / 2
+    k = 8
+    steps = (torch.arange(k, device=view.device) + torch.rand(len(chosen), 1, device=view.device)) / k * 2 - 1
+    depths = centre[:, 2:3] + reach * steps
+    in_camera = pool.passing_direction[chosen][:, None, :] * depths[..., None]
+    points = to_object(poses, in_camera.reshape(-1, 3), view.repeat_interleave(k))
+    unit = (points - model.low) / model.size
+    within = ((unit > 0) & (unit < 1)).all(-1)
+    inside = torch.where(within, (-model.sdf(points)).clamp(min=0), torch.zeros(()).to(points))
+    return (inside.reshape(-1, k).amax(1) / model.truncation_m).square().mean()
+
+
+def color_loss(model: ObjectField, poses: Poses, pool: RayPool, chosen: Tensor) -> Tensor:
+    """Mean absolute difference of the colour at the measured surface point."""
+    in_camera = pool.direction[chosen] * pool.depth[chosen][:, None]
+    _, rgb = model(to_object(poses, in_camera, pool.view[chosen]))
+    return (rgb - pool.rgb[chosen]).abs().mean()
+
+
+def eikonal_loss(model: ObjectField, points: Tensor) -> Tensor:
+    """Mean square of |gradient| - 1, by central differences of two millimetres."""
+    h = 0.002
+    shifts = torch.eye(3, device=points.device) * h
+    gradient = torch.stack([(model.sdf(points + s) - model.sdf(points - s)) / (2 * h) for s in shifts], -1)
+    return (gradient.norm(dim=-1) - 1).square().mean()
+
+
+def _groups(model: ObjectField, config: FieldConfig) -> list[dict[str, object]]:
+    networks = [*model.encoding.parameters(), *model.geometry.parameters(), *model.appearance.parameters()]
+    return [
+        {"params": networks, "lr": config.learning_rate},
+        {"params": [model.warm], "lr": config.warm_learning_rate},
+    ]

@@ -1,0 +1,161 @@
+"""What the field learns from: cropped, undistorted views of the object with its pose at both exposure times."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Float32, UInt8
+from numpy import ndarray as Array
+
+from recordings.errors import BadInput
+from recordings.geometry import CameraModel
+from recordings.records import RgbdFrame
+
+MARGIN_PX = 12
+"""Pixels kept around the mask: rays that pass the object tell where it is not."""
+EDGE_PX = 2
+"""Half width of the band along the mask's border that tells nothing: mixed pixels, fattened depth edges."""
+
+
+@dataclass(frozen=True, eq=False)
+class FieldView:
+    """One masked RGBD view, undistorted and cropped. `K` belongs to the crop.
+
+    `depth_m` is 0 where there is no trustworthy return on the object. `plane` is the local surface in camera
+    coordinates as n with n . X = 1 (fitted to inverse depth). `outside` marks rays that surely pass the object.
+    `camera_from_object` is the pose at the colour exposure, `camera_from_object_at_depth` at the depth exposure.
+    """
+
+    K: Float[Array, "3 3"]
+    color_rgb: UInt8[Array, "h w 3"]
+    depth_m: Float32[Array, "h w"]
+    plane: Float32[Array, "h w 3"]
+    inside: Bool[Array, "h w"]
+    outside: Bool[Array, "h w"]
+    camera_from_object: Float[Array, "4 4"]
+    camera_from_object_at_depth: Float[Array, "4 4"]
+
+    def posed(self, at_color: Float[Array, "4 4"], at_depth: Float[Array, "4 4"]) -> FieldView:
+        return replace(self, camera_from_object=at_color, camera_from_object_at_depth=at_depth)
+
+
+def make_view(
+    frame: RgbdFrame,
+    mask: Bool[Array, "h w"],
+    camera: CameraModel,
+    camera_from_object: Float[Array, "4 4"],
+    camera_from_object_at_depth: Float[Array, "4 4"],
+    hidden: Bool[Array, "h w"] | None = None,
+) -> FieldView | None:
+    """Cut a view out of a frame; None when the mask is empty. `hidden`: pixels of something that may stand in front
+    of the object (the robot): their rays tell nothing. Raises BadInput for a mask of another size."""
+    if mask.shape != frame.depth_m.shape:
+        raise BadInput(f"frame {frame.index}: a mask of {mask.shape}, the image has {frame.depth_m.shape}")
+    pinhole = replace(camera, distortion_model="none", distortion=())
+    maps = _undistortion(camera, pinhole)
+    mask = _remap(mask.astype(np.uint8), maps, cv2.INTER_NEAREST) > 0
+    ys, xs = np.nonzero(mask)
+    if len(ys) == 0:
+        return None
+    box = (
+        slice(max(ys.min() - MARGIN_PX, 0), ys.max() + MARGIN_PX + 1),
+        slice(max(xs.min() - MARGIN_PX, 0), xs.max() + MARGIN_PX + 1),
+    )
+    mask = mask[box]
+    depth_m = _remap(frame.depth_m, maps, cv2.INTER_NEAREST)[box]
+    K = camera.K.copy()
+    K[0, 2] -= box[1].start
+    K[1, 2] -= box[0].start
+    inside, outside = _erode(mask, EDGE_PX // 2), ~_dilate(mask, EDGE_PX)
+    if hidden is not None:
+        outside &= ~_dilate(_remap(hidden.astype(np.uint8), maps, cv2.INTER_NEAREST)[box] > 0, EDGE_PX)
+    depth_m, plane = _trusted(np.where(inside, depth_m, 0).astype(np.float32), K)
+    color_rgb = _remap(frame.color_rgb, maps, cv2.INTER_LINEAR)[box]
+    return FieldView(K, color_rgb, depth_m, plane, inside, outside, camera_from_object, camera_from_object_at_depth)
+
+
+def object_box(views: Sequence[FieldView], trim: float = 0.002) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+    """Low and high corner, in the object frame, of the box round all depth points but the outermost share `trim`."""
+    clouds = [object_points(v) for v in views]
+    points_m = np.concatenate([c for c in clouds if len(c)]) if any(len(c) for c in clouds) else np.zeros((0, 3))
+    if len(points_m) < 100:
+        raise BadInput(f"only {len(points_m)} depth points on the object in {len(views)} views; wanted at least 100")
+    return np.quantile(points_m, trim, axis=0), np.quantile(points_m, 1 - trim, axis=0)
+
+
+def object_points(view: FieldView) -> Float[Array, "n 3"]:
+    """The view's depth points in the object frame."""
+    v, u = np.nonzero(view.depth_m)
+    z = view.depth_m[v, u].astype(np.float64)
+    in_camera = np.stack([(u - view.K[0, 2]) / view.K[0, 0] * z, (v - view.K[1, 2]) / view.K[1, 1] * z, z], -1)
+    pose = view.camera_from_object_at_depth
+    return (in_camera - pose[:3, 3]) @ pose[:3, :3]
+
+
+def _trusted(
+    depth_m: Float32[Array, "h w"], K: Float[Array, "3 3"], window: int = 7, steepest: float = 0.15
+) -> tuple[Float32[Array, "h w"], Float32[Array, "h w 3"]]:
+    """Depth without flying pixels and grazing surfaces, and the local plane n (n . X = 1) of each pixel.
+
+    Over a plane 1/z is linear in pixel coordinates: 1/z = n . (x, y, 1), fitted by least squares in a window.
+    """
+    h, w = depth_m.shape
+    valid = depth_m > 0
+    inverse = np.where(valid, 1.0 / np.maximum(depth_m, 1e-3), 0.0)
+    x = np.broadcast_to((np.arange(w) - K[0, 2]) / K[0, 0], (h, w))
+    y = np.broadcast_to(((np.arange(h) - K[1, 2]) / K[1, 1])[:, None], (h, w))
+    basis = np.stack([x, y, np.ones((h, w))], -1)
+    normal_matrix, right = np.empty((h, w, 3, 3)), np.empty((h, w, 3))
+    for i in range(3):
+        right[..., i] = _box(basis[..., i] * inverse, window)
+        for j in range(3):
+            normal_matrix[..., i, j] = _box(basis[..., i] * basis[..., j] * valid, window)
+    scale = np.trace(normal_matrix, axis1=-2, axis2=-1)
+    solvable = valid & (_box(valid.astype(np.float64), window) > 0.4)
+    plane = np.zeros((h, w, 3))
+    safe = normal_matrix[solvable] + 1e-9 * scale[solvable, None, None] * np.eye(3)
+    plane[solvable] = np.linalg.solve(safe, right[solvable][..., None])[..., 0]
+    fitted = (plane * basis).sum(-1)
+    length = np.linalg.norm(plane, axis=-1)
+    facing = fitted / np.maximum(length * np.linalg.norm(basis, axis=-1), 1e-9)
+    on_surface = np.abs(inverse - fitted) < 0.008 * inverse
+    keep = solvable & (facing > steepest) & on_surface
+    plane = plane * np.where(keep, inverse / np.where(keep, fitted, 1.0), 0.0)[..., None]
+    return np.where(keep, depth_m, 0).astype(np.float32), plane.astype(np.float32)
+
+
+def _box(values: Float[Array, "h w"], window: int) -> Float[Array, "h w"]:
+    return cv2.boxFilter(values, cv2.CV_64F, (window, window), normalize=True, borderType=cv2.BORDER_CONSTANT)
+
+
+def _erode(mask: Bool[Array, "h w"], by: int) -> Bool[Array, "h w"]:
+    kernel = np.ones((2 * by + 1, 2 * by + 1), np.uint8)
+    return cv2.erode(mask.astype(np.uint8), kernel, borderType=cv2.BORDER_CONSTANT, borderValue=0) > 0
+
+
+def _dilate(mask: Bool[Array, "h w"], by: int) -> Bool[Array, "h w"]:
+    return cv2.dilate(mask.astype(np.uint8), np.ones((2 * by + 1, 2 * by + 1), np.uint8)) > 0
+
+
+def _undistortion(camera: CameraModel, pinhole: CameraModel) -> tuple[Array, Array] | None:
+    """Maps for cv2.remap; None for a camera without distortion."""
+    if camera.distortion_model == "none":
+        return None
+    key = (camera.distortion_model, camera.distortion, camera.K.tobytes(), camera.width, camera.height)
+    if key not in _MAPS:
+        source = camera.project(pinhole.pixel_rays()).astype(np.float32)
+        _MAPS.clear()
+        _MAPS[key] = (source[..., 0].copy(), source[..., 1].copy())
+    return _MAPS[key]
+
+
+_MAPS: dict[tuple[object, ...], tuple[Array, Array]] = {}
+
+
+def _remap(image: Array, maps: tuple[Array, Array] | None, how: int) -> Array:
+    if maps is None:
+        return image
+    return cv2.remap(image, maps[0], maps[1], how, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
