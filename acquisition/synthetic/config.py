@@ -138,7 +138,7 @@ class MonoConfig:
 class ArmConfig:
     """A Franka Panda that holds the object, winds up, tosses and releases."""
 
-    base_m: tuple[float, float] = (0.0, 0.5)
+    base_m: tuple[float, float] = (0.0, 0.6)
     base_yaw_deg: float = -90.0
     wind_up_s: float = 0.7
     slip_m: float = 0.0

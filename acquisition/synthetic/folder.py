@@ -9,14 +9,14 @@ from typing import Any
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, UInt8, UInt16
+from jaxtyping import Bool, UInt8, UInt16
 from numpy import ndarray as Array
 
 from acquisition.synthetic import physics
 from acquisition.synthetic.paint import PaintedMesh
-from acquisition.synthetic.scene import Lab, SyntheticFrame, SyntheticToss, simulate
+from acquisition.synthetic.scene import Lab, SyntheticToss, simulate
 from recordings.errors import BadInput, WriteFailed
-from recordings.geometry import CameraModel, Transform
+from recordings.geometry import CameraModel
 from recordings.progress import Progress, Silent
 
 TRUTH_DEPTH_UNIT_M = 0.0001

@@ -16,7 +16,7 @@ from acquisition.synthetic.solids import Chart, Solid
 from recordings.geometry import Transform
 from recordings.tracks import TagPlacement
 
-TABLE_HALF_M = (0.85, 0.62)
+TABLE_HALF_M = (0.85, 0.75)
 TABLE_THICKNESS_M = 0.03
 FLOOR_M = -0.74
 WALL_DISTANCE_M = 1.9

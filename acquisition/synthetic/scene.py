@@ -6,7 +6,6 @@ a whole toss. A driver that streams calls `Lab.color`, `Lab.depth`, `Lab.mono` a
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -15,7 +14,9 @@ from jaxtyping import Bool, Float, Float32, UInt8, UInt16
 from numpy import ndarray as Array
 
 from acquisition.synthetic import objects, sensors
+from acquisition.synthetic.arm import FORWARD_S, Arm, Swing
 from acquisition.synthetic.config import CameraConfig, SceneConfig
+from acquisition.synthetic.grasp import grasp
 from acquisition.synthetic.motion import Instants, Release, Trajectory, unseen_hand
 from acquisition.synthetic.optics import Light, Sight, StillPicture, View, picture, sight, still_picture
 from acquisition.synthetic.paint import paint_object
@@ -36,11 +37,13 @@ STILL_SAMPLES_PX = 3_200_000
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """One toss, before anything is rendered."""
+    """One toss, before anything is rendered. `free_s`: the fingers have let go (the release, where there is no arm)."""
 
     toss: int
     object: Trajectory
     instants: Instants
+    free_s: float
+    swing: Swing | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +89,8 @@ class Lab:
         painted, self.object_tags = paint_object(self.solid, config.object.surface, generator(config.seed, OBJECT))
         self.object = Body("object", painted)
         self.world_from_d455 = look_at(config.camera)
-        self.believed_world_from_d455 = self._believed()
+        self.arm = Arm(config.arm, grasp(config.object, self.solid)) if config.arm else None
+        self.believed_world_from_d455, self.believed_world_from_base = self._believed()
         facing = self.world_from_d455.rotation[:2, 2]
         room = build_room(config, facing / np.linalg.norm(facing), generator(config.seed, ROOM))
         self.table_tags = room.table_tags
@@ -119,18 +123,25 @@ class Lab:
         samples = int(np.clip(STILL_SAMPLES_PX / (view.camera.width * view.camera.height), 4, 16))
         return still_picture(view, self.room, self.light, generator(self.config.seed, STILL, number), samples)
 
-    def _believed(self) -> Transform:
-        """world_from_d455 as the calibration has it: off by a camera error, and by one of the plane that is world's."""
+    def _believed(self) -> tuple[Transform, Transform | None]:
+        """world_from_d455 and world_from_base as the calibration has them: each off by its own error, and both by one
+        of the plane that defines the world."""
         errors, rng = self.config.errors, generator(self.config.seed, ERRORS)
         camera = small_error("d455", errors.camera_m, errors.camera_deg, rng)
         tilt = rng.uniform(0, 2 * np.pi)
         turned = rotation_exp(np.deg2rad(errors.plane_deg) * np.array([np.cos(tilt), np.sin(tilt), 0.0]))
         plane = Transform("world", "world", turned, np.array([0.0, 0.0, errors.plane_m * rng.choice([-1, 1])]))
-        return plane @ self.world_from_d455 @ camera
+        if self.arm is None:
+            return plane @ self.world_from_d455 @ camera, None
+        base = small_error(self.arm.robot.root, errors.base_m, errors.base_deg, rng)
+        return plane @ self.world_from_d455 @ camera, plane @ self.arm.world_from_base @ base
 
     def placed(self, motion: Motion, time_s: float) -> list[Placed]:
         """Everything that moves, at an instant: the object first."""
-        return [Placed(self.object, motion.object.at(time_s))]
+        found = [Placed(self.object, motion.object.at(time_s))]
+        if self.arm is not None and motion.swing is not None:
+            found += self.arm.placed(motion.swing, time_s)
+        return found
 
     def color(self, motion: Motion, time_s: float, index: int, brightness: float = 1.0) -> UInt8[Array, "h w 3"]:
         """The colour image whose exposure is centred on `time_s`."""
@@ -176,15 +187,26 @@ class Lab:
     def _attempt(self, toss: int, rng: np.random.Generator) -> Motion | None:
         config = self.config.motion
         release = draw_release(self.config, self.object.radius_m, rng)
-        release_s = config.hold_s + config.lead_in_s
-        before = unseen_hand(release, config.hold_s, config.lead_in_s, 0.001)
+        release_s, swing = config.hold_s + config.lead_in_s, None
+        free_s = release_s
+        if self.arm is None:
+            before = unseen_hand(release, config.hold_s, config.lead_in_s, 0.001)
+        else:
+            release_s = config.hold_s + self.arm.config.wind_up_s + FORWARD_S
+            free_s = release_s + self.arm.config.finger_open_s
+            swing = self.arm.plan(release, rng.uniform(-0.5, 0.5), release_s)
+            if swing is None:
+                return None
+            sideways = rng.uniform(0, 2 * np.pi)
+            slip = self.arm.config.slip_m * np.array([np.cos(sideways), 0.0, np.sin(sideways)])
+            before, release = self.arm.carry(swing, slip, free_s, 0.004)
         if not self._all_seen(before):
             return None
-        after, impact_s, rest_s = self.table.drop(release, release_s, config.longest_free_s, config.rest_s)
+        after, impact_s, rest_s = self.table.drop(release, free_s, config.longest_free_s, config.rest_s)
         if not (np.isfinite(impact_s) and np.isfinite(rest_s) and self._all_seen(after)):
             return None
-        end_s = rest_s + config.rest_s
-        return Motion(toss, before.joined(after), Instants(config.hold_s, release_s, impact_s, rest_s, end_s))
+        instants = Instants(config.hold_s, release_s, impact_s, rest_s, rest_s + config.rest_s)
+        return Motion(toss, before.joined(after), instants, free_s, swing)
 
     def _all_seen(self, part: Trajectory) -> bool:
         """Whether the object is inside the image, above the table's height and over the table, all the time."""
@@ -322,7 +344,7 @@ def _frame(lab: Lab, motion: Motion, nominal: int, time_s: float, brightness: fl
         lab.color(motion, time_s, nominal, brightness),
         lab.depth(depth_seen, motion.toss, nominal),
         mask,
-        None,
+        seen.owner > 0 if motion.swing is not None else None,
         np.where(mask, seen.depth_m, 0).astype(np.float32),
         motion.object.at(time_s),
         brightness,
