@@ -16,6 +16,7 @@ from recordings.progress import Progress, Silent
 from recordings.results import Results
 from recordings.session import Session
 from recordings.session_writer import write_bytes
+from recordings.view_arm import known_arm, log_arm_model, log_arm_motion
 from recordings.view_blueprint import ABOUT, about_text, blueprint
 from recordings.view_bodies import log_bodies, log_rig
 from recordings.view_layers import EVENTS, TIME, Clock, Look, log_toss
@@ -138,12 +139,17 @@ def fill(recording: rr.RecordingStream, scene: Scene, look: Look, progress: Prog
     """Log all of a scene, toss by toss, so that a live viewer has the first one at once."""
     recording.log(ABOUT, rr.TextDocument(about_text(scene), media_type=rr.MediaType.MARKDOWN), static=True)
     log_rig(recording, scene, look)
+    robot = known_arm(scene)
+    if robot is not None:
+        log_arm_model(recording, robot)
     for toss in scene.tosses:
         clock = Clock(recording, toss, scene.shift_ns[toss])
         start_ns, end_ns = scene.spans_ns[toss]
         clear(clock.at(start_ns))
         clock.at(start_ns).log(EVENTS, rr.TextLog(f"toss {toss}: recording begins"))
         log_bodies(recording, scene, toss)
+        if robot is not None:
+            log_arm_motion(recording, scene, robot, toss)
         log_toss(recording, scene, toss, look, progress)
         recording.flush()  # the end is the last to arrive: who sees it has all of the toss
         clock.at(end_ns).log(EVENTS, rr.TextLog(f"toss {toss}: recording ends"))

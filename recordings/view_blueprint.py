@@ -8,13 +8,15 @@ import rerun.blueprint as rrb
 from jaxtyping import Float
 from numpy import ndarray as Array
 
+from recordings.view_arm import BASE
 from recordings.view_bodies import BODY, PATH
 from recordings.view_layers import ARM, COLOR, DEPTH, EVENTS, FRAMES, HEALTH, MOTION, TIME, Clock
 from recordings.view_scene import Scene, root_poses
 
 ABOUT = "about"
-EYE_FROM_TARGET = np.array([0.8, -0.95, 0.55])
+EYE_FROM_TARGET = np.array([1.0, -0.75, 0.6])
 """Where the first look comes from, in world axes: from the right, behind the colour camera's shoulder, from above."""
+ELBOW_M = np.array([0.0, 0.0, 0.7])
 SLOW = 0.25
 
 
@@ -62,7 +64,7 @@ def _space(scene: Scene) -> rrb.Spatial3DView:
 
 
 def centre_m(scene: Scene) -> Float[Array, "3"]:
-    """What the first look is at: between the middle of the first toss's motion and the middle of the cameras."""
+    """What the first look is at: between the middle of the first toss's motion and the middle of the devices."""
     moved = np.array([0.0, 0.0, 0.1])
     for body in scene.bodies:
         _, matrices = root_poses(scene, body.poses.get(scene.tosses[0], ()))
@@ -70,20 +72,24 @@ def centre_m(scene: Scene) -> Float[Array, "3"]:
         if len(known):
             moved = (known.min(axis=0) + known.max(axis=0)) / 2
             break
-    cameras = camera_places_m(scene)
-    return moved + 0.35 * (cameras.mean(axis=0) - moved) if len(cameras) else moved
+    devices = device_places_m(scene)
+    return moved + 0.35 * (devices.mean(axis=0) - moved) if len(devices) else moved
 
 
 def reach_m(scene: Scene, target: Float[Array, "3"]) -> float:
-    """How far the look stands back, so that every camera fits in."""
-    far = np.linalg.norm(camera_places_m(scene) - target, axis=1)
-    return float(np.clip(far.max(initial=0.5) * 1.3, 0.5, 4.0))
+    """How far the look stands back, so that every device fits in."""
+    far = np.linalg.norm(device_places_m(scene) - target, axis=1)
+    return float(np.clip(far.max(initial=0.5) * 1.3, 0.7, 4.0))
 
 
-def camera_places_m(scene: Scene) -> Float[Array, "n 3"]:
-    """Where the cameras are, in the root frame."""
-    places = [scene.root_from(camera.frame) for camera in scene.calibration.cameras.values()]
-    return np.array([p.translation_m for p in places if p is not None], dtype=np.float64).reshape(-1, 3)
+def device_places_m(scene: Scene) -> Float[Array, "n 3"]:
+    """Where the cameras are and, for an arm, where its elbow may be, in the root frame."""
+    frames = [scene.root_from(camera.frame) for camera in scene.calibration.cameras.values()]
+    places = [frame.translation_m for frame in frames if frame is not None]
+    root_from_base = scene.root_from(BASE)
+    if root_from_base is not None:
+        places.append(root_from_base.translation_m + ELBOW_M)
+    return np.array(places, dtype=np.float64).reshape(-1, 3)
 
 
 def _images(scene: Scene) -> rrb.Container | None:
@@ -137,18 +143,22 @@ def _words(scene: Scene) -> rrb.Container:
 
 def about_text(scene: Scene) -> str:
     """What is on the screen, for someone who sees it for the first time (Markdown)."""
-    lines = [f"# {scene.name}", f"{len(scene.tosses)} toss(es) of **{_object_name(scene)}**.", ""]
+    lines = [f"# {scene.name}", f"{_count(len(scene.tosses))} of **{_object_name(scene)}**.", ""]
     if scene.session is not None and scene.session.calibration.cameras:
         lines += ["- **Points**: what the depth camera measured, in its own colours."]
         lines += ["- **Pyramids**: the cameras, with the image each one sees."]
     if scene.calibration.table_tags:
         lines += ["- **Yellow squares**: the table's tags where the calibration has them."]
+    if scene.root_from(BASE) is not None:
+        lines += ["- **Arm**: moved by its recorded joint angles."]
+    if scene.root == "world":
+        lines += ["- **Grid**: the plane of the table, a line every 10 cm."]
     for body in scene.bodies:
         hidden = "" if body.shown else " (hidden: click its eye in the list of entities)"
         lines += [f"- **{_color_word(body.color)}**: {body.label}, and its way through the toss{hidden}."]
     lines += [
         "",
-        "Space starts and stops. The yellow range of the time line is the first toss; drag it to another.",
+        "Space starts and stops. The blue range of the time line is the first toss; drag it to another.",
         "",
     ]
     lines += ["| toss | from (s) | to (s) |", "|---|---|---|"]
@@ -158,6 +168,10 @@ def about_text(scene: Scene) -> str:
     if scene.notes:
         lines += ["", "**Not as complete as it could be**", *(f"- {note}" for note in scene.notes)]
     return "\n".join(lines)
+
+
+def _count(tosses: int) -> str:
+    return "One toss" if tosses == 1 else f"{tosses} tosses"
 
 
 def _object_name(scene: Scene) -> str:

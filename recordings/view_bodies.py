@@ -6,13 +6,13 @@ from collections.abc import Sequence
 
 import numpy as np
 import rerun as rr
-from jaxtyping import Float, Int64
+from jaxtyping import Bool, Float, Int64
 from numpy import ndarray as Array
 
 from recordings.geometry import CameraModel, Transform, quaternion_from_rotation, rotation_angle_rad
 from recordings.tracks import RigCalibration, TagPlacement
 from recordings.view_layers import COLOR, MOTION, Clock, Look
-from recordings.view_outline import Outline
+from recordings.view_mesh import Outline, shaded_mesh
 from recordings.view_scene import Body, Color, Scene, root_poses
 
 BODY, PATH, TAGS = "world/object/{}", "world/path/{}", "world/table_tags"
@@ -22,6 +22,7 @@ TAG_COLOR: Color = (255, 225, 60)
 SOLID = 190
 """Opacity of a mesh: what was measured shines through."""
 AXES_M = 0.06
+AXES_COLORS: tuple[Color, ...] = ((255, 80, 90), (60, 180, 90), (110, 120, 255))
 
 
 def log_rig(recording: rr.RecordingStream, scene: Scene, look: Look) -> None:
@@ -86,41 +87,52 @@ def log_bodies(recording: rr.RecordingStream, scene: Scene, toss: int) -> None:
     clock = Clock(recording, toss, scene.shift_ns[toss])
     start_ns = scene.spans_ns[toss][0]
     for body in scene.bodies:
-        entity = BODY.format(body.name)
-        hide(clock, entity, start_ns)
+        clock.at(start_ns).log(BODY.format(body.name), rr.Clear(recursive=True))
         times_ns, matrices = root_poses(scene, body.poses.get(toss, ()))
         log_path(clock, body, start_ns, matrices)
         if len(times_ns) == 0:
             continue
-        log_shape(clock, scene, body, toss, matrices)
-        log_poses(clock, entity, times_ns, matrices)
+        log_poses(clock, scene, body, times_ns, matrices)
         log_motion(clock, scene, body, times_ns, matrices)
         if body.shown:
             log_outlines(clock, scene, body, times_ns, matrices)
 
 
-def hide(clock: Clock, entity: str, time_ns: int) -> None:
-    """A body that is lost, or not in this toss, is scaled away: nothing is drawn at a place that nobody knows."""
-    clock.at(time_ns).log(entity, rr.Transform3D(translation=[0, 0, 0], quaternion=[0, 0, 0, 1], scale=[0, 0, 0]))
-
-
-def log_shape(clock: Clock, scene: Scene, body: Body, toss: int, matrices: Float[Array, "n 4 4"]) -> None:
-    """The mesh in the body's colour; where no shape is known, axes and a box as high as the pose rests."""
-    entity, start_ns = BODY.format(body.name), scene.spans_ns[toss][0]
-    shape = body.shape(toss)
-    if shape is not None:
-        mesh = rr.Mesh3D(
-            vertex_positions=shape.vertices_m.astype(np.float32),
-            triangle_indices=shape.faces.astype(np.uint32),
-            albedo_factor=(*body.color, SOLID),
-        )
-        clock.at(start_ns).log(f"{entity}/shape", mesh)
-        return
-    clock.at(start_ns).log(f"{entity}/axes", rr.TransformAxes3D(AXES_M))
+def log_poses(
+    clock: Clock, scene: Scene, body: Body, times_ns: Int64[Array, " n"], matrices: Float[Array, "n 4 4"]
+) -> None:
+    """The body at its poses. While it is lost nothing is drawn: it is cleared, and drawn anew where it is found."""
+    entity = BODY.format(body.name)
+    known = np.isfinite(matrices).all(axis=(1, 2))
     half_m = guessed_half_m(scene, matrices)
+    for first, after in runs(known):
+        log_shape(clock, body, int(times_ns[first]), half_m)
+        if after < len(known):
+            clock.at(int(times_ns[after])).log(entity, rr.Clear(recursive=True))
+    if known.any():
+        wxyz = np.array([quaternion_from_rotation(m[:3, :3]) for m in matrices[known]])
+        columns = rr.Transform3D.columns(translation=matrices[known, :3, 3], quaternion=wxyz[:, [1, 2, 3, 0]])
+        clock.columns(entity, times_ns[known], columns)
+
+
+def runs(known: Bool[Array, " n"]) -> list[tuple[int, int]]:
+    """Where runs of True begin, and the position after each."""
+    edges = np.flatnonzero(np.diff(np.r_[False, known, False].astype(int)))
+    return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2])]
+
+
+def log_shape(clock: Clock, body: Body, time_ns: int, half_m: float | None) -> None:
+    """The mesh in the body's colour; where no shape is known, axes and a box as high as the pose rests."""
+    entity = BODY.format(body.name)
+    shape = body.shape(clock.toss)
+    if shape is not None:
+        clock.at(time_ns).log(f"{entity}/shape", shaded_mesh(shape, (*body.color, SOLID)))
+        return
+    axes = rr.Arrows3D(vectors=np.eye(3) * AXES_M, colors=AXES_COLORS)  # rerun's own axes cannot be cleared
+    clock.at(time_ns).log(f"{entity}/axes", axes)
     if half_m is not None:
         box = rr.Boxes3D(half_sizes=[[half_m] * 3], colors=[body.color], labels=["shape not known"])
-        clock.at(start_ns).log(f"{entity}/box", box)
+        clock.at(time_ns).log(f"{entity}/box", box)
 
 
 def guessed_half_m(scene: Scene, matrices: Float[Array, "n 4 4"]) -> float | None:
@@ -131,18 +143,6 @@ def guessed_half_m(scene: Scene, matrices: Float[Array, "n 4 4"]) -> float | Non
     return float(heights[-1])
 
 
-def log_poses(clock: Clock, entity: str, times_ns: Int64[Array, " n"], matrices: Float[Array, "n 4 4"]) -> None:
-    known = np.isfinite(matrices).all(axis=(1, 2))
-    safe = np.where(known[:, None, None], matrices, np.eye(4))
-    wxyz = np.array([quaternion_from_rotation(m[:3, :3]) for m in safe])
-    columns = rr.Transform3D.columns(
-        translation=safe[:, :3, 3],
-        quaternion=wxyz[:, [1, 2, 3, 0]],
-        scale=np.repeat(known[:, None], 3, axis=1).astype(float),
-    )
-    clock.columns(entity, times_ns, columns)
-
-
 def log_path(clock: Clock, body: Body, start_ns: int, matrices: Float[Array, "n 4 4"]) -> None:
     """The way of the body's origin through the toss; broken where it was lost."""
     strips = unbroken(matrices[:, :3, 3])
@@ -151,9 +151,7 @@ def log_path(clock: Clock, body: Body, start_ns: int, matrices: Float[Array, "n 
 
 def unbroken(points: Float[Array, "n 3"]) -> list[Float[Array, "m 3"]]:
     """Runs of finite points, each of two or more."""
-    known = np.isfinite(points).all(axis=1)
-    edges = np.flatnonzero(np.diff(np.r_[False, known, False].astype(int)))
-    return [points[a:b] for a, b in zip(edges[::2], edges[1::2]) if b - a > 1]
+    return [points[a:b] for a, b in runs(np.isfinite(points).all(axis=1)) if b - a > 1]
 
 
 def log_motion(

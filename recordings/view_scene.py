@@ -208,8 +208,17 @@ def moment_ns(scene: Scene, toss: int) -> int:
     for body in scene.bodies:
         times_ns, matrices = root_poses(scene, body.poses.get(toss, ()))
         if scene.root == "world" and np.isfinite(matrices).any():
-            return int(times_ns[np.nanargmax(matrices[:, 2, 3])])  # the top of the flight
+            return half_way_down_ns(times_ns, matrices[:, 2, 3])
     return (start + end) // 2
+
+
+def half_way_down_ns(times_ns: Int64[Array, " n"], heights_m: Float[Array, " n"]) -> int:
+    """When a falling body is first half way between its highest and its last height. NaN heights are passed over."""
+    known = np.flatnonzero(np.isfinite(heights_m))
+    times_ns, heights_m = times_ns[known], heights_m[known]
+    top = int(heights_m.argmax())
+    below = heights_m[top:] <= (heights_m[top] + heights_m[-1]) / 2
+    return int(times_ns[top + int(below.argmax())])
 
 
 def entity_name(text: str) -> str:

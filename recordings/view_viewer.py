@@ -21,6 +21,8 @@ LOOPBACK = "127.0.0.1"
 START_TIMEOUT_S = 60.0
 LOAD_TIMEOUT_S = 120.0
 POLL_S = 0.1
+NOTICES_GONE_S = 5.0
+"""The viewer greets with notices over its window for about four seconds; no command takes them away."""
 SAME_PICTURES = 3
 """A picture is complete when this many in a row are the same bytes and the viewer reports nothing as loading."""
 NO_VULKAN = (
@@ -55,6 +57,7 @@ class Viewer:
 
     def __init__(self, headless: bool, size: tuple[int, int] = (1280, 800)) -> None:
         self.url = ""
+        self._started_s = 0.0
         self._headless = headless
         self._size = size
         self._process: subprocess.Popen[bytes] | None = None
@@ -116,12 +119,13 @@ class Viewer:
         """A PNG of the whole window, taken when nothing is loading any more and the picture stands still."""
         same, last = 1, b""
         deadline = time.monotonic() + LOAD_TIMEOUT_S
-        while same < SAME_PICTURES:
+        while same < SAME_PICTURES or time.monotonic() < self._started_s + NOTICES_GONE_S:
             state = self._loaded(deadline)
             now = self.client.take_screenshot()
             same = same + 1 if now == last else 1
             last = now
             _refuse_broken(state)
+            time.sleep(POLL_S)
             if time.monotonic() > deadline:
                 raise ViewerFailed(f"the viewer's picture did not come to rest within {LOAD_TIMEOUT_S:.0f} s")
         return last
@@ -147,6 +151,8 @@ class Viewer:
             arguments.append("--headless")
         self._log = tempfile.TemporaryFile()  # noqa: SIM115
         environment = {**os.environ, "RERUN_APP_ONLY": "true"}  # no question about analytics
+        if self._headless:
+            environment["RUST_LOG"] = "error"  # information and warnings become notices over the picture
         self._process = subprocess.Popen(
             [rerun_program(), *arguments], stdout=self._log, stderr=self._log, env=environment
         )
@@ -160,6 +166,7 @@ class Viewer:
                 try:
                     client = ViewerClient.connect(self.url)
                     client.get_state()
+                    self._started_s = time.monotonic()
                     return client
                 except (RuntimeError, ConnectionError, OSError, ValueError):
                     pass  # it listens before it draws: ask again

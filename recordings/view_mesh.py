@@ -1,20 +1,66 @@
-"""The visible outline of a mesh in an image: edges between a face that looks at the camera and one that looks away."""
+"""Meshes for the viewer: shaded in 3D, and their visible outline in an image."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+import rerun as rr
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray as Array
 
 from recordings.geometry import CameraModel, Transform
 from recordings.tracks import ObjectShape
 
+FEW_FACES = 5_000
+
+
+def shaded_mesh(shape: ObjectShape, rgba: tuple[int, int, int, int]) -> rr.Mesh3D:
+    """A shape in one colour: with sharp edges where it has few faces, smooth where it has many."""
+    if len(shape.faces) <= FEW_FACES:
+        return flat_mesh(shape.vertices_m, shape.faces, albedo_factor=rgba)
+    return rr.Mesh3D(
+        vertex_positions=shape.vertices_m.astype(np.float32),
+        triangle_indices=shape.faces.astype(np.uint32),
+        vertex_normals=vertex_normals(shape.vertices_m, shape.faces).astype(np.float32),
+        albedo_factor=rgba,
+    )
+
+
+def flat_mesh(vertices_m: Float[Array, "v 3"], faces: Int[Array, "f 3"], **look: Any) -> rr.Mesh3D:
+    """Every face with corners and a normal of its own."""
+    corners = vertices_m[faces]
+    normals = unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+    return rr.Mesh3D(
+        vertex_positions=corners.reshape(-1, 3).astype(np.float32),
+        triangle_indices=np.arange(3 * len(faces), dtype=np.uint32).reshape(-1, 3),
+        vertex_normals=np.repeat(normals, 3, axis=0).astype(np.float32),
+        **look,
+    )
+
+
+def vertex_normals(vertices_m: Float[Array, "v 3"], faces: Int[Array, "f 3"]) -> Float[Array, "v 3"]:
+    """Unit normals at the vertices: the area-weighted mean of the faces around each."""
+    corners = vertices_m[faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    summed = np.zeros_like(vertices_m)
+    for k in range(3):
+        np.add.at(summed, faces[:, k], normals)
+    return unit(summed)
+
+
+def unit(vectors: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
+    """Vectors of length one; a zero vector stays zero."""
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-30)
+
 
 @dataclass(frozen=True, eq=False)
 class Outline:
-    """A mesh prepared for outlines. `faces[e]` are the two faces at edge e; the second is -1 on an open border."""
+    """A mesh prepared for its outline: the edges between a face that looks at the camera and one that looks away.
+
+    `faces[e]` are the two faces at edge e; the second is -1 on an open border.
+    """
 
     vertices_m: Float[Array, "v 3"]
     edges: Int[Array, "e 2"]
