@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast, get_args
 
 import cv2
 import numpy as np
@@ -39,6 +39,7 @@ from recordings.records import (
     TossEvent,
 )
 from recordings.schemas import tosslab_pb2 as own
+from recordings.tracks import Status
 
 _LEVELS = {"info": Log.INFO, "warning": Log.WARNING, "error": Log.ERROR}
 _FOXGLOVE_MODELS: dict[DistortionModel, str] = {
@@ -85,7 +86,8 @@ def encode_image(image: EncodedImage) -> Payload:
     channels = 3 if image.encoding == "rgb8" else 1
     if len(image.data) != image.width * image.height * channels:
         raise BadInput(
-            f"{image.camera} image {image.index}: {len(image.data)} bytes are not {image.width}x{image.height} {image.encoding}"
+            f"{image.camera} image {image.index}: {len(image.data)} bytes are not "
+            f"{image.width}x{image.height} {image.encoding}"
         )
     raw = RawImage(
         frame_id=image.camera,
@@ -105,13 +107,13 @@ def read_image(message: Message, camera: str, schema: str, size: tuple[int, int]
         box = _parse(CompressedImage, message)
         if box.format not in ("jpeg", "png"):
             raise BadInput(f"{message.topic}: images in '{box.format}'; wanted jpeg or png")
-        encoding: ImageEncoding = box.format
+        encoding = cast(ImageEncoding, box.format)
         width, height = size
     elif schema == "foxglove.RawImage":
         box = _parse(RawImage, message)
         if box.encoding not in ("rgb8", "mono8"):
             raise BadInput(f"{message.topic}: raw images in '{box.encoding}'; wanted rgb8 or mono8")
-        encoding, width, height = box.encoding, box.width, box.height
+        encoding, width, height = cast(ImageEncoding, box.encoding), box.width, box.height
     else:
         raise BadInput(f"{message.topic}: schema {schema}; wanted foxglove.CompressedImage or foxglove.RawImage")
     return EncodedImage(
@@ -160,6 +162,8 @@ def read_depth(message: Message, camera: str, schema: str, unit_m: float) -> Dep
             raise BadInput(f"{message.topic}: depth codec '{box.codec}'; this tosslab reads '{DEPTH_CODEC}'")
         raw = unpack_depth(box.data, box.height, box.width)
         unit_m = box.unit_m
+        if not 0 < unit_m < 1:
+            raise DamagedFile(f"{message.topic}: a depth unit of {unit_m} m")
     elif schema == "foxglove.RawImage":
         box = _parse(RawImage, message)
         if box.encoding != "16UC1" or len(box.data) != 2 * box.width * box.height:
@@ -227,13 +231,13 @@ def read_pose(message: Message, quality: Message | None) -> StampedPose:
             box.frame_id, "object", np.array([q.w, q.x, q.y, q.z]), np.array([p.x, p.y, p.z])
         ).matrix
     status = beside.status if beside is not None else "tracked"
-    if status not in ("tracked", "interpolated", "lost"):
+    if status not in get_args(Status):
         raise DamagedFile(f"{message.topic}: status '{status}'; wanted tracked, interpolated or lost")
     covariance = (
         np.array(beside.covariance).reshape(6, 6) if beside is not None and len(beside.covariance) == 36 else None
     )
     source = beside.source_frame if beside is not None else "object"
-    return StampedPose(_time_ns(box.timestamp), box.frame_id, source, matrix, status, covariance)
+    return StampedPose(_time_ns(box.timestamp), box.frame_id, source, matrix, cast(Status, status), covariance)
 
 
 def encode_command(command: TossCommand) -> Payload:
@@ -297,7 +301,7 @@ def decode_mask(data: bytes, name: str) -> Array:
     pixels = _imdecode(data, cv2.IMREAD_UNCHANGED)
     if pixels is None:
         raise DamagedFile(f"{name}: no readable PNG")
-    return pixels.any(axis=-1) if pixels.ndim == 3 else pixels > 0
+    return np.asarray(pixels.any(axis=-1) if pixels.ndim == 3 else pixels > 0)
 
 
 def _imdecode(data: bytes, flags: int) -> Array | None:

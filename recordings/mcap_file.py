@@ -13,7 +13,7 @@ import zlib
 from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TypeVar
 
@@ -138,14 +138,14 @@ class McapFile:
         times = np.empty(len(index), dtype=np.int64)
         for i in range(len(index)):
             times[i] = self._guard(
-                lambda i=i: self._publish_time(int(index.chunk[i]), int(index.offset[i])), f"message {i} of {topic}"
+                partial(self._publish_time, int(index.chunk[i]), int(index.offset[i])), f"message {i} of {topic}"
             )
         return times
 
     def metadata(self, name: str) -> list[dict[str, str]]:
         """Every metadata record of that name."""
         places = [m.offset for m in self.summary.metadata_indexes if m.name == name]
-        return [self._guard(lambda o=o: self._record(o, Metadata), f"metadata {name}").metadata for o in places]
+        return [self._guard(partial(self._record, o, Metadata), f"metadata {name}").metadata for o in places]
 
     def attachments(self) -> list[str]:
         return [a.name for a in self.summary.attachment_indexes]
@@ -198,7 +198,7 @@ class McapFile:
 
     def _read_summary(self) -> Summary:
         footer = self._exactly(self.size - 37, 29)
-        opcode, length, start, offsets_start, crc = struct.unpack("<BQQQI", footer)
+        opcode, length, start, _, crc = struct.unpack("<BQQQI", footer)
         if opcode != Opcode.FOOTER or length != 20:
             raise ValueError("no footer")
         if start == 0:

@@ -101,8 +101,11 @@ def record_at(file: Bytes, offset: int) -> Record:
     opcode, length = HEAD.unpack(file.exactly(offset, HEAD.size))
     if opcode not in _KNOWN and opcode < 0x80:
         raise ValueError(f"no record at byte {offset}: opcode 0x{opcode:02x}")
-    if length > file.size - offset - HEAD.size or _FIXED_LENGTH.get(opcode, length) != length:
-        raise ValueError(f"the record at byte {offset} says it is {length} bytes long")
+    left = file.size - offset - HEAD.size
+    if length > left:
+        raise ValueError(f"the file ends within the record at byte {offset} (its length is {length}, {left} are left)")
+    if _FIXED_LENGTH.get(opcode, length) != length:
+        raise ValueError(f"the record at byte {offset} has an impossible length ({length})")
     return Record(opcode, offset, file.exactly(offset + HEAD.size, length))
 
 

@@ -91,6 +91,10 @@ class McapWriter:
             return {self._channels[i].topic: n for i, n in self._kept.items()}
 
     @property
+    def path(self) -> Path:
+        return self._sink.path
+
+    @property
     def bytes_written(self) -> int:
         return self._sink.position
 
@@ -184,7 +188,7 @@ class McapWriter:
         return self._sink.sha256
 
     def abandon(self) -> None:
-        """Stop without a summary: what was accepted is flushed, and `toss-session recover` reads the file. Never raises."""
+        """Stop without a summary: what was accepted is flushed, `toss-session recover` reads the file. Never raises."""
         if self._stop.is_set():
             return
         with self._lock:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -15,6 +14,8 @@ from numpy import ndarray as Array
 
 from recordings import arm_codec, codec, sync
 from recordings.align import align_depth
+from recordings.documents import FORMAT_VERSION, mapping, parse_document, parse_json, positive_number, whole_number
+from recordings.documents import read_document as read_document
 from recordings.errors import BadInput, DamagedFile
 from recordings.geometry import CameraModel
 from recordings.mcap_file import McapFile, Message
@@ -30,7 +31,6 @@ from recordings.records import (
     TossWindow,
     depth_in_metres,
 )
-from recordings.session_writer import FORMAT_VERSION
 from recordings.tracks import RigCalibration
 
 T_co = TypeVar("T_co", covariant=True)
@@ -73,8 +73,8 @@ class Frames(Sequence[T_co], Generic[T_co]):
 class RgbdFrames(Frames[RgbdFrame]):
     """Colour frames with the depth that belongs to each, aligned to colour.
 
-    `depth_times_ns` equals `times_ns` where a colour image has no depth image (its depth is all 0); those positions are in
-    `without_depth`. `unused_depth` counts depth images that belong to no colour image.
+    `depth_times_ns` equals `times_ns` where a colour image has no depth image (its depth is all 0); those positions are
+    in `without_depth`. `unused_depth` counts depth images that belong to no colour image.
     """
 
     def __init__(
@@ -111,7 +111,13 @@ class Toss:
         self.file = McapFile(path)
         self.calibration = _read_attached_calibration(self.file)
         self.info = _own_metadata(self.file)
-        self.index = int(self.info.get("toss", 0))
+        self.index = whole_number(self.info.get("toss", 0), f"{path}: its toss number")
+
+    def __enter__(self) -> Toss:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
 
     def close(self) -> None:
         self.file.close()
@@ -143,16 +149,20 @@ class Toss:
             return Frames(
                 np.zeros(0, dtype=np.int64), lambda i: codec.read_depth(self.file.read(topic, i), camera, "", 0)
             )
-        unit_m = float(self.file.channels[topic].metadata.get("unit_m", 0.001))
+        unit_m = positive_number(
+            self.file.channels[topic].metadata.get("unit_m", "0.001"), f"{self.path}: {topic} unit_m"
+        )
         schema = self._schema(topic)
         times_ns = self.file.publish_times_ns(topic)
         return Frames(times_ns, lambda i: codec.read_depth(self.file.read(topic, i), camera, schema, unit_m))
 
     def rgbd(self, camera: str = "d455") -> RgbdFrames:
-        """Colour frames with their depth, aligned. Raises BadInput where there is no colour stream or no way to align."""
+        """Colour frames with their depth, aligned. Raises BadInput where a stream or the way to align is missing."""
         colors, depths = self.color(camera), self.depth(camera)
         if len(colors) == 0:
             raise BadInput(f"{self.path.name} has no images on /{camera}/color; it has {sorted(self.file.channels)}")
+        if len(depths) == 0:
+            raise BadInput(f"{self.path.name} has no images on /{camera}/depth; it has {sorted(self.file.channels)}")
         period_ns = sync.frame_period_ns(colors.times_ns) or 33_333_333
         pairs = sync.pair_nearest(colors.times_ns, depths.times_ns, int(PAIR_WITHIN_PERIODS * period_ns))
         depth_times_ns = colors.times_ns.copy()
@@ -162,14 +172,15 @@ class Toss:
 
         def load(i: int) -> RgbdFrame:
             image = colors[i]
-            rgb = codec.decode_image(image)
+            rgb: Array = codec.decode_image(image)
             depth_m = np.zeros(rgb.shape[:2], dtype=np.float32)
             if paired[i]:
                 depth_m = aligner(depth_in_metres(depths[int(pairs[i])]))
             if depth_m.shape != rgb.shape[:2]:
                 raise BadInput(
-                    f"{self.path.name}: colour is {rgb.shape[1]}x{rgb.shape[0]}, depth {depth_m.shape[1]}x{depth_m.shape[0]} and "
-                    "not aligned to it; wanted the depth camera's intrinsics and its place (d455_depth) in calibration.json"
+                    f"{self.path.name}: colour is {rgb.shape[1]}x{rgb.shape[0]}, depth {depth_m.shape[1]}x"
+                    f"{depth_m.shape[0]} and not aligned to it; wanted the depth camera's intrinsics and its place "
+                    f"({camera}_depth) in calibration.json"
                 )
             return RgbdFrame(camera, image.index, image.time_ns, int(depth_times_ns[i]), rgb, depth_m)
 
@@ -248,10 +259,16 @@ class Session:
     ) -> None:
         self.path = path
         self.calibration = calibration
-        self.start: Mapping[str, Any] = document.get("start") or {}
-        self.stop: Mapping[str, Any] = document.get("stop") or {}
+        self.start: Mapping[str, Any] = mapping(document.get("start"), f"{path}: its start document")
+        self.stop: Mapping[str, Any] = mapping(document.get("stop"), f"{path}: its stop document")
         self._files = files
         self._open: dict[int, Toss] = {}
+
+    def __enter__(self) -> Session:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
 
     @staticmethod
     def open(path: Path) -> Session:
@@ -262,7 +279,7 @@ class Session:
 
     @property
     def name(self) -> str:
-        return str(self.start.get("name") or self.path.resolve().stem)
+        return str(self.start.get("name") or self.path.resolve().name.removesuffix(".mcap"))
 
     @property
     def tosses(self) -> tuple[int, ...]:
@@ -270,7 +287,7 @@ class Session:
 
     @property
     def object_name(self) -> str:
-        return str((self.start.get("object") or {}).get("name", "object"))
+        return str(mapping(self.start.get("object"), f"{self.path}: its object").get("name", "object"))
 
     @cached_property
     def truth_folder(self) -> Path | None:
@@ -310,16 +327,19 @@ def _open_folder(path: Path) -> Session:
     if calibration_path.exists():
         calibration = RigCalibration.read(calibration_path)
     else:
-        calibration = Toss(files[min(files)]).calibration if files else RigCalibration(cameras={})
+        calibration = RigCalibration(cameras={})
+        if files:
+            with Toss(files[min(files)]) as toss:
+                calibration = toss.calibration
     return Session(path, document, calibration, files)
 
 
 def _open_file(path: Path) -> Session:
     toss = Toss(path)
     attached = toss.file.attachment("session.json")
-    document = _parse_document(attached, f"{path}: session.json") if attached else {}
+    document = parse_document(attached, f"{path}: session.json") if attached else {}
     stop = toss.file.metadata("tosslab.stop")
-    streams = _parse_json(stop[-1].get("streams", "{}"), f"{path}: its counts") if stop else {}
+    streams = parse_json(stop[-1].get("streams", "{}"), f"{path}: its counts") if stop else {}
     document = {
         **document,
         "stop": {"status": stop[-1].get("status", "") if stop else "", "streams": {path.stem: streams}},
@@ -327,30 +347,6 @@ def _open_file(path: Path) -> Session:
     session = Session(path, document, toss.calibration, {toss.index: path})
     session._open[toss.index] = toss
     return session
-
-
-def read_document(path: Path) -> Mapping[str, Any]:
-    """session.json, checked for its version. Raises BadInput."""
-    try:
-        data = path.read_bytes()
-    except OSError as refused:
-        raise BadInput(f"{path} cannot be read: {refused.strerror}") from refused
-    return _parse_document(data, str(path))
-
-
-def _parse_document(data: bytes, name: str) -> Mapping[str, Any]:
-    document = _parse_json(data, name)
-    if not isinstance(document, dict) or document.get("format_version") != FORMAT_VERSION:
-        found = document.get("format_version") if isinstance(document, dict) else type(document).__name__
-        raise BadInput(f"{name}: format_version {found!r}; this tosslab reads {FORMAT_VERSION}")
-    return document
-
-
-def _parse_json(data: bytes | str, name: str) -> Any:
-    try:
-        return json.loads(data)
-    except (json.JSONDecodeError, UnicodeDecodeError) as wrong:
-        raise DamagedFile(f"{name} is no readable JSON ({wrong})") from wrong
 
 
 def _own_metadata(file: McapFile) -> Mapping[str, Any]:
@@ -363,7 +359,7 @@ def _own_metadata(file: McapFile) -> Mapping[str, Any]:
     version = own[0].get("format_version")
     if version != str(FORMAT_VERSION):
         raise BadInput(f"{file.path}: format_version {version!r}; this tosslab reads {FORMAT_VERSION}")
-    info = _parse_json(own[0].get("info", "{}"), f"{file.path}: its metadata")
+    info = parse_json(own[0].get("info", "{}"), f"{file.path}: its metadata")
     return info if isinstance(info, dict) else {}
 
 
@@ -371,7 +367,8 @@ def _read_attached_calibration(file: McapFile) -> RigCalibration:
     attached = file.attachment("calibration.json")
     if attached is None:
         return RigCalibration(cameras={})
-    return RigCalibration.from_json(_parse_json(attached, f"{file.path}: calibration.json"))
+    name = f"{file.path}: calibration.json"
+    return RigCalibration.from_json(mapping(parse_json(attached, name), name))
 
 
 def _ranges(numbers: Sequence[int]) -> str:

@@ -17,13 +17,13 @@ from jaxtyping import Bool
 from numpy import ndarray as Array
 
 from recordings import arm_codec, codec
+from recordings.documents import FORMAT_VERSION as FORMAT_VERSION
 from recordings.errors import BadInput, WriteFailed
 from recordings.geometry import Transform
 from recordings.mcap_writer import McapWriter
 from recordings.records import ArmStates, DepthImage, EncodedImage, HealthLine, StampedPose, TossCommand, TossEvent
 from recordings.tracks import RigCalibration
 
-FORMAT_VERSION = 1
 NO_CALIBRATION = RigCalibration(cameras={})
 
 
@@ -41,8 +41,8 @@ class TossWriter:
         self.sha256: str | None = None
         self._calibration = calibration
         self._writer = McapWriter(path)
-        self._channels: dict[str, tuple[int, type]] = {}
-        self._schemas: dict[type, int] = {}
+        self._channels: dict[str, tuple[int, Any]] = {}
+        self._schemas: dict[Any, int] = {}
         self._sizes: dict[str, tuple[int, int]] = {}
         self._dropped: dict[str, int] = {}
         self._arm_samples = 0
@@ -74,7 +74,8 @@ class TossWriter:
     def depth(self, image: DepthImage) -> None:
         if image.raw.dtype != np.uint16 or not 0 < image.unit_m < 1:
             raise BadInput(
-                f"{image.camera} depth {image.index}: wanted uint16 with a unit in metres, found {image.raw.dtype}, {image.unit_m}"
+                f"{image.camera} depth {image.index}: wanted uint16 with a unit in metres, "
+                f"found {image.raw.dtype}, {image.unit_m}"
             )
         topic = f"/{image.camera}/depth"
         height, width = image.raw.shape
@@ -115,7 +116,7 @@ class TossWriter:
         self._dropped[topic] = self._dropped.get(topic, 0) + count
 
     def streams(self) -> dict[str, dict[str, int]]:
-        """Received, written and dropped by topic, for the stop document. `written` lies in chunks that the disk took."""
+        """Received, written and dropped by topic, for the stop document. `written`: in chunks that the disk took."""
         accepted, kept = self._writer.counts, self._writer.kept if self._ended else self._writer.counts
         return {
             topic: {
@@ -180,7 +181,7 @@ class TossWriter:
         if first is not schema:
             raise BadInput(
                 f"{topic}: {schema.DESCRIPTOR.full_name} after {first.DESCRIPTOR.full_name}; one encoding per toss"
-            )  # type: ignore[attr-defined]
+            )
         return number
 
     def _begin(self, time_ns: int) -> None:

@@ -9,15 +9,19 @@ from numpy import ndarray as Array
 UNPAIRED = -1
 
 
-def pair_nearest(
-    times_ns: Int64[Array, " n"], others_ns: Int64[Array, " m"], max_gap_ns: int
-) -> Int64[Array, " n"]:
+def pair_nearest(times_ns: Int64[Array, " n"], others_ns: Int64[Array, " m"], max_gap_ns: int) -> Int64[Array, " n"]:
     """For each time the index of its nearest other, each used at most once; UNPAIRED where none is near enough.
 
-    Both must grow. When two times want the same other, the nearer one gets it and the other stays unpaired.
+    When two times want the same other, the nearer one gets it and the other stays unpaired. Neither must be in order.
     """
     if len(others_ns) == 0 or len(times_ns) == 0:
         return np.full(len(times_ns), UNPAIRED, dtype=np.int64)
+    order = np.argsort(others_ns, kind="stable")
+    pairs = _pair_ordered(times_ns, others_ns[order], max_gap_ns)
+    return np.where(pairs == UNPAIRED, UNPAIRED, order[pairs])
+
+
+def _pair_ordered(times_ns: Int64[Array, " n"], others_ns: Int64[Array, " m"], max_gap_ns: int) -> Int64[Array, " n"]:
     right = np.searchsorted(others_ns, times_ns).clip(0, len(others_ns) - 1)
     left = (right - 1).clip(0)
     gap_left, gap_right = np.abs(times_ns - others_ns[left]), np.abs(times_ns - others_ns[right])
