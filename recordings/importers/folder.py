@@ -34,6 +34,14 @@ CLOCK = "every toss has its own clock starting at 0; toss k starts at clock_offs
 
 
 @dataclass(frozen=True, eq=False)
+class _Images:
+    """Image files and their times on the toss's own clock."""
+
+    paths: Sequence[Path]
+    time_ns: Int64[Array, " n"]
+
+
+@dataclass(frozen=True, eq=False)
 class _Toss:
     """One toss of the layout, listed and timed but not read. Times are on its own clock."""
 
@@ -43,13 +51,13 @@ class _Toss:
     color_ns: Int64[Array, " n"]
     depth: Sequence[Path]
     depth_ns: Int64[Array, " m"]
-    mono: dict[str, Sequence[Path]] = field(default_factory=dict)
-    mono_ns: Int64[Array, " k"] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    mono: dict[str, _Images] = field(default_factory=dict)
     arm: ArmStates | None = None
     about: dict[str, Any] = field(default_factory=dict)
 
     def span_ns(self) -> tuple[int, int]:
-        times = [self.color_ns, self.depth_ns, self.mono_ns] + ([self.arm.time_ns] if self.arm is not None else [])
+        times = [self.color_ns, self.depth_ns, *(m.time_ns for m in self.mono.values())]
+        times += [self.arm.time_ns] if self.arm is not None else []
         return min(int(t[0]) for t in times if len(t)), max(int(t[-1]) for t in times if len(t))
 
 
@@ -87,8 +95,10 @@ def _start(out: Path, layout: Layout, warnings: Warnings) -> dict[str, Any]:
         "arm": layout.document.get("arm"),
     }
     start["import"] |= {"document": dict(layout.document), "warnings": list(warnings.all())}
-    if layout.board is not None:
-        start["board"] = dict(layout.board)
+    if layout.mono:
+        left = {k: v for k, v in layout.mono_document.items() if k not in ("cameras", "calibration_board")}
+        start["import"]["mono_document"] = left
+        start["board"] = layout.mono_document.get("calibration_board")
     return start
 
 
@@ -114,12 +124,12 @@ def _list_toss(folder: Path, number: int, layout: Layout, warnings: Warnings) ->
     else:
         _same_frames(folder, color, depth)
         depth_ns = color_ns
-    mono, mono_ns = _list_mono(layout, folder.name)
+    mono = _list_mono(layout, folder.name)
     about = common.read_json_object(folder / "toss.json") if (folder / "toss.json").exists() else {}
     if about.get("frames") not in (None, len(color)):
         warnings.add(f"{folder.name}: toss.json says {about['frames']} frames, {len(color)} colour images are there")
     arm = _read_arm(folder / "arm.csv", str(layout.document.get("arm", "franka_panda")))
-    return _Toss(number, folder, color, color_ns, depth, depth_ns, mono, mono_ns, arm, about)
+    return _Toss(number, folder, color, color_ns, depth, depth_ns, mono, arm, about)
 
 
 def _images(folder: Path, suffixes: Sequence[str]) -> Sequence[Path]:
@@ -148,22 +158,21 @@ def _same_frames(folder: Path, color: Sequence[Path], depth: Sequence[Path]) -> 
         )
 
 
-def _list_mono(layout: Layout, toss: str) -> tuple[dict[str, Sequence[Path]], Int64[Array, " k"]]:
+def _list_mono(layout: Layout, toss: str) -> dict[str, _Images]:
+    """mono/toss_XX/<camera>/, with one timestamps.txt for all cameras or one in a camera's own folder."""
     folder = layout.source / "mono" / toss
     if not folder.is_dir():
-        return {}, np.zeros(0, dtype=np.int64)
+        return {}
     cameras = sorted(p.name for p in folder.iterdir() if p.is_dir())
     unknown = sorted(set(cameras) - set(layout.mono))
     if unknown:
         raise BadInput(f"{folder}: cameras {unknown} are not in mono/cameras.json, which has {sorted(layout.mono)}")
-    times_ns = common.read_stamps_ns(folder / "timestamps.txt")
-    images = {camera: _images(folder / camera, IMAGE_SUFFIXES) for camera in cameras}
-    for camera, files in images.items():
-        if len(files) != len(times_ns):
-            raise BadInput(
-                f"{folder / camera}: {len(files)} images, timestamps.txt has {len(times_ns)} lines; wanted as many"
-            )
-    return images, times_ns
+    found = {}
+    for camera in cameras:
+        paths, own = _images(folder / camera, IMAGE_SUFFIXES), folder / camera / "timestamps.txt"
+        times = own if own.exists() else folder / "timestamps.txt"
+        found[camera] = _Images(paths, _stamps(times, len(paths), f"images of {camera}"))
+    return found
 
 
 def _read_arm(path: Path, arm: str) -> ArmStates | None:
@@ -205,8 +214,8 @@ def _write_toss(writer: SessionWriter, toss: _Toss, layout: Layout, offset_ns: i
         if mask is not None:
             t.mask(0, mask)
         mono = [
-            _images_in_time(t, paths, layout.calibration.camera(camera), camera, toss.mono_ns + offset_ns, grey=True)
-            for camera, paths in toss.mono.items()
+            _images_in_time(t, m.paths, layout.calibration.camera(camera), camera, m.time_ns + offset_ns, grey=True)
+            for camera, m in toss.mono.items()
         ]
         common.write_in_order(
             _images_in_time(t, toss.color, layout.color, "d455", toss.color_ns + offset_ns),

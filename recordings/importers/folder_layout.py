@@ -19,7 +19,7 @@ from recordings.tracks import RigCalibration, TagPlacement
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """session.json of the folder layout, understood. `document` is the file as it is, `board` that of the mono cameras."""
+    """session.json of the folder layout, understood. `document` is the file as it is, `mono_document` mono/cameras.json."""
 
     source: Path
     document: Mapping[str, Any]
@@ -28,7 +28,7 @@ class Layout:
     depth_aligned: bool
     object: Mapping[str, Any]
     mono: tuple[str, ...]
-    board: Mapping[str, Any] | None
+    mono_document: Mapping[str, Any]
 
     @property
     def color(self) -> CameraModel:
@@ -64,7 +64,7 @@ def read_layout(source: Path, warnings: Warnings) -> Layout:
         warnings.add("depth is not aligned to colour: it is kept as it is and aligned with its calibration when read")
     if not any(t.source == "d455" for t in transforms):
         warnings.add(f"{path.name} has no T_world_camera: the camera's place in the world is not known")
-    mono, board = _mono_cameras(source / "mono" / "cameras.json")
+    mono, mono_document = _mono_cameras(source / "mono" / "cameras.json")
     family, tags = _table_tags(document, path)
     return Layout(
         source=source,
@@ -74,7 +74,7 @@ def read_layout(source: Path, warnings: Warnings) -> Layout:
         depth_aligned=depth_aligned,
         object=_object(document.get("object"), path),
         mono=tuple(mono),
-        board=board,
+        mono_document=mono_document,
     )
 
 
@@ -175,12 +175,11 @@ def _table_tags(document: Mapping[str, Any], path: Path) -> tuple[str, tuple[Tag
     return str(given.get("family", "tag36h11")), tags
 
 
-def _mono_cameras(path: Path) -> tuple[dict[str, CameraModel], Mapping[str, Any] | None]:
+def _mono_cameras(path: Path) -> tuple[dict[str, CameraModel], Mapping[str, Any]]:
     if not path.exists():
-        return {}, None
+        return {}, {}
     document = read_json_object(path)
     given = document.get("cameras")
     if not isinstance(given, list) or not all(isinstance(c, dict) and isinstance(c.get("name"), str) for c in given):
         raise BadInput(f"{path}: no 'cameras'; wanted a list of {{name, K, distortion, width, height}}")
-    board = document.get("calibration_board")
-    return {c["name"]: camera_model(c, c["name"], str(path)) for c in given}, board
+    return {c["name"]: camera_model(c, c["name"], str(path)) for c in given}, document
