@@ -31,7 +31,9 @@ class DenseGrid(nn.Module):
 
 
 class HashGrid(nn.Module):
-    """Multi-resolution hash encoding (Mueller et al. 2022): levels of trilinear grids whose nodes share hashed tables."""
+    """Multi-resolution hash encoding (Mueller et al. 2022): levels of trilinear grids with hashed tables."""
+
+    corners: Tensor
 
     def __init__(
         self, levels: int = 8, coarsest: int = 16, finest: int = 128, table_bits: int = 16, features: int = 2

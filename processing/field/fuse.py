@@ -8,15 +8,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import no_type_check
 
 import numba
 import numpy as np
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Bool, Float, Float32, Int
 from numpy import ndarray as Array
 from scipy import ndimage
 from scipy.spatial import ConvexHull, QhullError
 
 from processing.field.views import FieldView, object_box
+
+BEHIND_FULL = np.float32(0.3)
+"""Cells further behind a surface than this share of the truncation count less and less: near an edge they belong to
+another face (weighed fully they bulge it out; weighed down from the surface on, noisy poses shrink the object)."""
 
 
 @dataclass(frozen=True)
@@ -97,7 +102,8 @@ def _spread(rgb: Float32[Array, "a b c 3"], known: Bool[Array, "a b c"]) -> Floa
 
 
 @numba.njit(cache=True, nogil=True, fastmath=True)
-def _integrate(total, weight, passed, blocked, paint, low, voxel, truncation, pose, K, depth, plane, outside, rgb):  # type: ignore[no-untyped-def]
+@no_type_check  # numba cannot cache what the tests' type checker wraps
+def _integrate(total, weight, passed, blocked, paint, low, voxel, truncation, pose, K, depth, plane, outside, rgb):
     """One view into the sums. Cells are walked along the last axis; all lengths in metres."""
     height, width = depth.shape
     n0, n1, n2 = total.shape
@@ -130,8 +136,8 @@ def _integrate(total, weight, passed, blocked, paint, low, voxel, truncation, po
                                     w *= np.float32(0.3)
                                 else:
                                     blocked[i, j, k] += 1
-                                    if distance < 0:
-                                        w *= np.float32(1.0) + distance / truncation
+                                    if distance < -BEHIND_FULL * truncation:
+                                        w *= (np.float32(1.0) + distance / truncation) / (np.float32(1.0) - BEHIND_FULL)
                                 if abs(distance) < np.float32(0.6) * truncation:
                                     for c in range(3):
                                         paint[i, j, k, c] += w * facing * rgb[v, u, c] / np.float32(255)
@@ -154,16 +160,18 @@ def complete(grid: Grid) -> Grid:
     surface = np.argwhere((grid.weight > 0) & (np.abs(grid.sdf_m) < grid.voxel_m) & ~grid.free)
     unseen_inside = inside_hull(grid.sdf_m.shape, surface) & ~seen & ~grid.free
     solid = np.where(seen, grid.sdf_m < 0, unseen_inside)
-    distance_m = grid.voxel_m * (
-        ndimage.distance_transform_edt(~solid) - ndimage.distance_transform_edt(solid)
-    ).astype(np.float32)
+    distance_m = grid.voxel_m * (ndimage.distance_transform_edt(~solid) - ndimage.distance_transform_edt(solid)).astype(
+        np.float32
+    )
     distance_m -= np.sign(distance_m) * np.float32(0.5 * grid.voxel_m)
     near = seen & (np.abs(grid.sdf_m) < 0.999 * grid.truncation_m)
     sdf_m = np.where(near, grid.sdf_m, distance_m).astype(np.float32)
-    return Grid(grid.origin_m, grid.voxel_m, grid.truncation_m, sdf_m, np.where(seen, grid.weight, 0), grid.free, grid.rgb)
+    return Grid(
+        grid.origin_m, grid.voxel_m, grid.truncation_m, sdf_m, np.where(seen, grid.weight, 0), grid.free, grid.rgb
+    )
 
 
-def inside_hull(shape: tuple[int, ...], cells: Float[Array, "n 3"]) -> Bool[Array, "a b c"]:
+def inside_hull(shape: tuple[int, ...], cells: Int[Array, "n 3"]) -> Bool[Array, "a b c"]:
     """Which cells lie inside the convex hull of given cells (slightly shrunk against outliers)."""
     if len(cells) < 10:
         return np.zeros(shape, dtype=bool)

@@ -22,9 +22,7 @@ def extract_mesh(field: ObjectField, grid: Grid, object_frame: str = "object", s
     """
     sdf_m = _evaluate(field, grid)
     vertices_m, faces = surface_of(sdf_m, grid)
-    return ObjectShape(
-        object_frame, source, vertices_m, faces, _colors(field, vertices_m), _observed(grid, vertices_m)
-    )
+    return ObjectShape(object_frame, source, vertices_m, faces, _colors(field, vertices_m), _observed(grid, vertices_m))
 
 
 def grid_mesh(grid: Grid, object_frame: str = "object", source: str = "fused") -> ObjectShape:

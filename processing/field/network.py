@@ -11,7 +11,7 @@ from processing.field.fuse import Grid
 
 
 class ObjectField(nn.Module):
-    """sdf(x) = warm start(x) + truncation * residual(encoding(x)); colour likewise, its residual through a deeper network.
+    """sdf(x) = warm start(x) + truncation * residual(encoding(x)); colour likewise, through a deeper network.
 
     The warm start is the fused grid of distance and colour, itself a parameter. Points are metres in the object frame;
     distances are metres, positive outside. Colours are RGB, 0..1 (not clipped).

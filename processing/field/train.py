@@ -111,7 +111,7 @@ def _optimise(
     for step in range(config.steps):
         optimiser.zero_grad(set_to_none=True)
         loss = total_loss(model, poses, pool, config)
-        loss.backward()  # type: ignore[no-untyped-call]
+        loss.backward()
         optimiser.step()
         schedule.step()
         if step % 10 == 0:
@@ -164,7 +164,9 @@ def near_surface_loss(
     behind = torch.where(target < 0, 1 + target / model.truncation_m, torch.ones_like(target)).clamp(0.05)
     sharp = (pool.depth.median() / depth) ** 4
     gap = (sdf - target) / model.truncation_m
-    return (behind * sharp.clamp(max=4) * torch.nn.functional.huber_loss(gap, torch.zeros_like(gap), reduction="none", delta=0.3)).mean(), points
+    weight = behind * sharp.clamp(max=4)
+    huber = torch.nn.functional.huber_loss(gap, torch.zeros_like(gap), reduction="none", delta=0.3)
+    return (weight * huber).mean(), points
 
 
 def free_space_loss(model: ObjectField, poses: Poses, pool: RayPool, chosen: Tensor) -> Tensor:

@@ -1,0 +1,163 @@
+"""The field on a cube that is drawn by an exact ray cast: every answer is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from processing.field.fuse import FuseConfig, fuse
+from processing.field.mesh import extract_mesh, grid_mesh
+from processing.field.train import FieldConfig, train_field
+from processing.field.views import FieldView, make_view
+from recordings.errors import BadInput
+from recordings.geometry import CameraModel
+from recordings.records import RgbdFrame
+
+HALF_M = 0.04
+RED_OF_FACE = (60, 140, 220)
+"""Red tells the axis of a face; green and blue are chequered."""
+CAMERA = CameraModel("d455", 160, 120, np.array([[190.0, 0, 79.5], [0, 190.0, 59.5], [0, 0, 1]]))
+
+
+def looking_at_cube(turn: Rotation) -> np.ndarray:
+    pose = np.eye(4)
+    pose[:3, :3] = turn.as_matrix()
+    pose[:3, 3] = [0.0, 0.0, 0.35]
+    return pose
+
+
+def draw(pose: np.ndarray, noise_m: float = 0.0, seed: int = 0) -> tuple[RgbdFrame, np.ndarray]:
+    """An exact picture of a chequered cube."""
+    rays = CAMERA.pixel_rays()
+    origin, along = -pose[:3, :3].T @ pose[:3, 3], rays @ pose[:3, :3]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        first, second = (-HALF_M - origin) / along, (HALF_M - origin) / along
+    enter, leave = np.minimum(first, second).max(-1), np.maximum(first, second).min(-1)
+    mask = (enter < leave) & (enter > 0)
+    points = origin + np.where(mask, enter, 0)[..., None] * along
+    chequer = np.floor(points / 0.02 + 1e-4).astype(int).sum(-1) % 2
+    shade = (0.3 + 0.5 * chequer) * 255
+    red = np.array(RED_OF_FACE)[np.abs(points).argmax(-1)]
+    rgb = np.where(mask[..., None], np.stack([red, shade * 0.8, 255 - shade], -1), 90).astype(np.uint8)
+    noise = noise_m * np.random.default_rng(seed).normal(size=mask.shape)
+    depth_m = np.where(mask, enter + noise, 0.9).astype(np.float32)
+    return RgbdFrame("d455", seed, 0, 0, rgb, depth_m), mask
+
+
+def cube_views(count: int, noise_m: float = 0.0005) -> list[FieldView]:
+    turns = Rotation.random(count, random_state=1)
+    views = []
+    for i, turn in enumerate(turns):
+        pose = looking_at_cube(turn)
+        frame, mask = draw(pose, noise_m, i)
+        view = make_view(frame, mask, CAMERA, pose, pose)
+        assert view is not None
+        views.append(view)
+    return views
+
+
+def distance_to_cube_m(points_m: np.ndarray) -> np.ndarray:
+    q = np.abs(points_m) - HALF_M
+    return np.linalg.norm(np.maximum(q, 0), axis=-1) + np.minimum(q.max(-1), 0)
+
+
+@pytest.fixture(scope="module")
+def views() -> list[FieldView]:
+    return cube_views(24)
+
+
+def test_fusing_exact_poses_gives_the_cube(views):
+    shape = grid_mesh(fuse(views, FuseConfig(truncation_m=0.005)))
+    error_m = np.abs(distance_to_cube_m(shape.vertices_m))
+    assert np.median(error_m) < 0.0002
+    assert np.quantile(error_m, 0.95) < 0.001
+
+
+def test_the_mesh_is_watertight_faces_outward_and_all_of_it_was_seen(views):
+    import trimesh
+
+    shape = grid_mesh(fuse(views, FuseConfig(truncation_m=0.005)))
+    mesh = trimesh.Trimesh(shape.vertices_m, shape.faces)
+    assert mesh.is_watertight
+    assert mesh.volume == pytest.approx((2 * HALF_M) ** 3, rel=0.02)
+    assert shape.observed.mean() > 0.98
+
+
+def test_what_no_view_saw_is_closed_and_marked_unobserved():
+    turns = [Rotation.from_euler("xyz", [a, b, 0]) for a in (-0.7, 0.0, 0.7) for b in (-0.7, 0.0, 0.7)]
+    views = []
+    for turn in turns:
+        frame, mask = draw(looking_at_cube(turn))
+        views.append(make_view(frame, mask, CAMERA, looking_at_cube(turn), looking_at_cube(turn)))
+    shape = grid_mesh(fuse(views, FuseConfig(truncation_m=0.005)))
+    seen, unseen = shape.vertices_m[shape.observed], shape.vertices_m[~shape.observed]
+    assert len(unseen) > 100
+    assert unseen[:, 2].mean() > seen[:, 2].mean() + 0.02  # the side turned away from every camera
+
+
+def test_refinement_pulls_disturbed_poses_back(views):
+    random = np.random.default_rng(3)
+    disturbed = []
+    for view in views:
+        off = np.eye(4)
+        off[:3, :3] = Rotation.from_rotvec(np.radians(0.8) * random.normal(size=3)).as_matrix()
+        off[:3, 3] = 0.001 * random.normal(size=3)
+        pose = view.camera_from_object @ off
+        disturbed.append(view.posed(pose, pose))
+    trained = train_field(disturbed, FieldConfig(steps=0))
+    assert spread_deg(trained.views, views) < 0.4 * spread_deg(disturbed, views)
+
+
+def spread_deg(estimated, true) -> float:
+    """Median rotation error after the best common alignment."""
+    gaps = [np.linalg.inv(e.camera_from_object) @ t.camera_from_object for e, t in zip(estimated, true, strict=True)]
+    turns = Rotation.from_matrix([g[:3, :3] for g in gaps])
+    return float(np.degrees(np.median((turns.mean().inv() * turns).magnitude())))
+
+
+@pytest.mark.parametrize("encoding", ["dense", "hash"])
+def test_both_encodings_reach_the_same_surface(views, encoding):
+    torch.set_num_threads(1)
+    trained = train_field(views, FieldConfig(encoding=encoding, steps=40, pose_rounds=0, rays=1024))
+    shape = extract_mesh(trained.field, trained.grid)
+    assert np.median(np.abs(distance_to_cube_m(shape.vertices_m))) < 0.0003
+    assert trained.losses[-1] < 2 * trained.losses[0]
+
+
+def test_vertex_colours_are_the_cubes(views):
+    trained = train_field(views, FieldConfig(steps=20, pose_rounds=0, rays=1024))
+    shape = extract_mesh(trained.field, trained.grid)
+    size = np.abs(shape.vertices_m)
+    for axis, red in enumerate(RED_OF_FACE):
+        inner = (size.argmax(1) == axis) & (np.sort(size, axis=1)[:, 1] < HALF_M - 0.006)
+        assert np.median(shape.vertex_rgb[inner, 0]) == pytest.approx(red, abs=12)
+
+
+def test_the_same_seed_gives_the_same_field(views):
+    config = FieldConfig(steps=5, rays=256)
+    first, second = train_field(views[:8], config), train_field(views[:8], config)
+    assert first.losses == second.losses
+    np.testing.assert_array_equal(first.views[3].camera_from_object, second.views[3].camera_from_object)
+
+
+def test_an_empty_mask_gives_no_view():
+    pose = looking_at_cube(Rotation.identity())
+    frame, mask = draw(pose)
+    assert make_view(frame, np.zeros_like(mask), CAMERA, pose, pose) is None
+
+
+def test_a_mask_of_another_size_is_refused():
+    pose = looking_at_cube(Rotation.identity())
+    frame, _ = draw(pose)
+    with pytest.raises(BadInput, match="a mask of"):
+        make_view(frame, np.ones((3, 3), dtype=bool), CAMERA, pose, pose)
+
+
+def test_views_without_depth_are_refused():
+    pose = looking_at_cube(Rotation.identity())
+    frame, mask = draw(pose)
+    blind = RgbdFrame("d455", 0, 0, 0, frame.color_rgb, np.zeros_like(frame.depth_m))
+    with pytest.raises(BadInput, match="depth points"):
+        fuse([make_view(blind, mask, CAMERA, pose, pose)], FuseConfig())
