@@ -1,0 +1,318 @@
+"""Follows the object from frame to frame with several hypotheses, because one frame of a symmetric body does not tell.
+
+Each hypothesis is a list of poses; its model is the views at those poses, so a new branch costs nothing. A frame's
+candidates (motion prior, shift of the cloud, feature matches, a grid of turns when all else fits badly) are aligned and
+ranked by how well they fit plus what the change of motion costs; the best few live on.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from jaxtyping import Float, Int
+from numpy import ndarray as Array
+
+from processing.track import kernels as k
+from processing.track.features import FeatureMatcher, Features, RansacConfig, relative_motions
+from processing.track.keyframes import KeyframeConfig, is_new, references
+from processing.track.motion import MotionConfig, change_cost, moved, turn_between
+from processing.track.views import ViewStore
+from recordings.geometry import rotation_exp
+
+Schedule = tuple[tuple[float, float, float, float, float, float], ...]
+"""Rows of kernels.align_view: level (0 sharp, 1 smooth), steps, depth scale (m at 0.8 m), grey scale, outline scale (m at
+0.8 m), share of the samples."""
+
+USUAL_DISTANCE_M = 0.8
+
+
+@dataclass(frozen=True)
+class BeamConfig:
+    """How hypotheses are made, ranked and dropped."""
+
+    width: int = 4
+    """Hypotheses kept."""
+    branches: int = 3
+    """Candidates of one hypothesis that may live on."""
+    coarse: Schedule = ((1, 6, 0.012, 0.5, 0.010, 0.15), (1, 4, 0.006, 0.4, 0.008, 0.3))
+    fine: Schedule = ((0, 5, 0.004, 0.4, 0.006, 0.4), (0, 6, 0.0025, 0.3, 0.005, 1.0))
+    grid: Schedule = ((1, 5, 0.012, 0.5, 0.010, 0.1),)
+    doubt: float = 0.07
+    """A frame whose best fit costs more asks for feature matches."""
+    search: float = 0.13
+    """A frame whose best fit costs more even then asks for the grid of turns."""
+    lost: float = 0.33
+    """A frame whose best fit costs more is no basis for others."""
+    least_on_surface: float = 0.35
+    apart_deg: float = 6.0
+    """Nearer candidates are the same."""
+    spread: float = 0.35
+    """Worse than the best by more than this: dropped."""
+    grid_deg: tuple[float, ...] = (20.0, 40.0, 65.0)
+    grid_axes: int = 20
+    motion: MotionConfig = field(default_factory=MotionConfig)
+    keyframes: KeyframeConfig = field(default_factory=KeyframeConfig)
+    ransac: RansacConfig = field(default_factory=RansacConfig)
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """What the beam looks at: views, their times, gravity, where the body's middle is (object frame)."""
+
+    store: ViewStore
+    times_s: Float[Array, " n"]
+    gravity_camera_m_s2: Float[Array, "3"]
+    center_m: Float[Array, "3"]
+    matcher: FeatureMatcher
+    features: dict[int, Features] = field(default_factory=dict)
+
+    def described(self, view: int) -> Features:
+        if view not in self.features:
+            self.features[view] = self.matcher.describe(self.store, view)
+        return self.features[view]
+
+
+@dataclass(frozen=True, eq=False)
+class Hypothesis:
+    """Poses (n, 4, 4), NaN where not tracked yet or lost; views that serve as model; the sum of what they cost."""
+
+    poses: Float[Array, "n 4 4"]
+    costs: Float[Array, " n"]
+    on_surface: Float[Array, " n"]
+    done: tuple[int, ...]
+    keyframes: tuple[int, ...]
+    total: float
+
+    @property
+    def tracked(self) -> tuple[int, ...]:
+        return tuple(i for i in self.done if np.isfinite(self.poses[i, 0, 0]))
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """One pose for one frame: what it costs to fit, with the price of the motion, and how much lies on the surface."""
+
+    pose: Float[Array, "4 4"]
+    fit: float
+    price: float
+    on_surface: float
+    source: str
+
+    @property
+    def cost(self) -> float:
+        return self.fit + self.price
+
+
+@dataclass(frozen=True, eq=False)
+class Followed:
+    """The beam's answer: the best hypothesis, how far behind the next different one ended, and what was rejected."""
+
+    best: Hypothesis
+    margin: float
+    rejected: dict[int, list[Candidate]]
+
+
+def rows(schedule: Schedule, distance_m: float) -> Float[Array, "r 6"]:
+    """The schedule's scales for an object at this distance: stereo depth errors grow with its square."""
+    out = np.array(schedule, dtype=np.float64)
+    ratio = distance_m / USUAL_DISTANCE_M
+    out[:, k.GEOMETRY_M] *= np.clip(ratio**2, 0.5, 4.0)
+    out[:, k.OUTLINE_M] *= np.clip(ratio, 0.5, 2.0)
+    return out
+
+
+def follow(
+    scene: Scene,
+    order: Int[Array, " m"],
+    start: Hypothesis,
+    config: BeamConfig,
+    on_step: object = None,
+) -> Followed:
+    """Track the views in `order` (forward or backward in time) from what `start` already holds."""
+    beam = [start]
+    rejected: dict[int, list[Candidate]] = {}
+    for i in order:
+        i = int(i)
+        if not scene.store.usable(i):
+            beam = [_without(h, i) for h in beam]
+            continue
+        grown: list[Hypothesis] = []
+        for h in beam:
+            kept, others = _branches(scene, h, i, config)
+            rejected.setdefault(i, []).extend(others)
+            grown += [_extended(h, i, c, scene, config) for c in kept]
+        beam = _pruned(grown, i, config)
+        if callable(on_step):
+            on_step(i, beam)
+    margin = beam[1].total - beam[0].total if len(beam) > 1 else np.inf
+    return Followed(beam[0], float(margin), rejected)
+
+
+def started(store: ViewStore, count: int, view: int, pose: Float[Array, "4 4"]) -> Hypothesis:
+    """A hypothesis that knows one view's pose."""
+    poses = np.full((count, 4, 4), np.nan)
+    poses[view] = pose
+    costs, on = np.full(count, np.nan), np.full(count, np.nan)
+    costs[view], on[view] = 0.0, 1.0
+    return Hypothesis(poses, costs, on, (view,), (view,), 0.0)
+
+
+def _without(h: Hypothesis, i: int) -> Hypothesis:
+    return replace(h, done=(*h.done, i))
+
+
+def _extended(h: Hypothesis, i: int, c: Candidate, scene: Scene, config: BeamConfig) -> Hypothesis:
+    """The hypothesis with one more frame; a frame that fits too badly stays without a pose."""
+    if c.fit > config.lost or c.on_surface < config.least_on_surface:
+        return replace(h, done=(*h.done, i), total=h.total + config.lost + 0.1)
+    poses, costs, on = h.poses.copy(), h.costs.copy(), h.on_surface.copy()
+    poses[i], costs[i], on[i] = c.pose, c.fit, c.on_surface
+    keys = h.keyframes
+    if is_new(poses, i, keys, scene.center_m, config.keyframes):
+        keys = (*keys, i)
+    return Hypothesis(poses, costs, on, (*h.done, i), keys, h.total + c.cost)
+
+
+def _pruned(grown: list[Hypothesis], i: int, config: BeamConfig) -> list[Hypothesis]:
+    """The best few that differ from each other."""
+    grown = sorted(grown, key=lambda h: h.total)
+    kept: list[Hypothesis] = []
+    for h in grown:
+        if h.total > grown[0].total + config.spread or len(kept) >= config.width:
+            break
+        if all(_differ(h, other, i, config) for other in kept):
+            kept.append(h)
+    return kept
+
+
+def _differ(a: Hypothesis, b: Hypothesis, i: int, config: BeamConfig) -> bool:
+    """Whether two hypotheses disagree about this frame."""
+    one, two = a.poses[i], b.poses[i]
+    if not (np.isfinite(one[0, 0]) and np.isfinite(two[0, 0])):
+        return bool(np.isfinite(one[0, 0]) != np.isfinite(two[0, 0])) and a.done != b.done
+    return bool(np.degrees(np.linalg.norm(turn_between(one, two))) > config.apart_deg)
+
+
+def _branches(scene: Scene, h: Hypothesis, i: int, config: BeamConfig) -> tuple[list[Candidate], list[Candidate]]:
+    """Candidates of one hypothesis for frame i: those that may live on, best first, and the others."""
+    starts = _usual_starts(scene, h, i)
+    found = _aligned_all(scene, h, i, starts, config)
+    if not found or found[0].fit > config.doubt:
+        found = _merged(found + _aligned_all(scene, h, i, _feature_starts(scene, h, i, config), config), config)
+    if not found or found[0].fit > config.search:
+        found = _merged(found + _searched(scene, h, i, starts, config), config)
+    if not found:
+        nothing = Candidate(np.full((4, 4), np.nan), 1.0, 0.0, 0.0, "none")
+        return [nothing], []
+    kept = [c for c in found if c.cost < found[0].cost + config.spread][: config.branches]
+    return kept, [c for c in found if c not in kept]
+
+
+def _usual_starts(scene: Scene, h: Hypothesis, i: int) -> list[tuple[str, Float[Array, "4 4"]]]:
+    """Motion prior, the same put on the seen cloud, the last pose put on the seen cloud."""
+    tracked = h.tracked
+    last = h.poses[tracked[-1]]
+    shift = scene.store.center_m[i] - scene.store.center_m[tracked[-1]]
+    shifted = last.copy()
+    shifted[:3, 3] += shift
+    starts = [("shift", shifted)]
+    if len(tracked) > 1:
+        a, b = tracked[-2], tracked[-1]
+        step_s, next_s = scene.times_s[b] - scene.times_s[a], scene.times_s[i] - scene.times_s[b]
+        prior = moved(h.poses[a], last, step_s, next_s, scene.center_m, scene.gravity_camera_m_s2)
+        on_cloud = prior.copy()
+        on_cloud[:3, 3] = last[:3, 3] + shift
+        starts = [("prior", prior), ("prior on cloud", on_cloud), *starts]
+    return starts
+
+
+def _feature_starts(scene: Scene, h: Hypothesis, i: int, config: BeamConfig) -> list[tuple[str, Float[Array, "4 4"]]]:
+    """Poses that feature matches to the last view and to the keyframes say."""
+    here = scene.described(i)
+    starts = []
+    for j in dict.fromkeys((h.tracked[-1], *reversed(h.keyframes[-8:]))):
+        for motion in relative_motions(scene.matcher, scene.described(j), here, config.ransac, seed=i, most=2):
+            starts.append((f"features of {j}", motion.other_from_one @ h.poses[j]))
+    return starts[:8]
+
+
+def turn_grid(angles_deg: tuple[float, ...], axes: int) -> Float[Array, "n 3 3"]:
+    """Rotations by each angle about axes spread evenly over the sphere (Fibonacci)."""
+    n = np.arange(axes) + 0.5
+    z, phi = 1 - 2 * n / axes, np.pi * (1 + 5**0.5) * n
+    r = np.sqrt(1 - z * z)
+    directions = np.stack([r * np.cos(phi), r * np.sin(phi), z], -1)
+    return np.array([rotation_exp(d * np.radians(a)) for a in angles_deg for d in directions])
+
+
+def _searched(
+    scene: Scene, h: Hypothesis, i: int, starts: list[tuple[str, Float[Array, "4 4"]]], config: BeamConfig
+) -> list[Candidate]:
+    """Coarse alignment from a grid of turns about the body's middle; the best few aligned finely."""
+    base = [s for s in starts if s[0] in ("shift", "prior on cloud")]
+    tries = []
+    for _, pose in base:
+        middle = pose[:3, :3] @ scene.center_m + pose[:3, 3]
+        for turn in turn_grid(config.grid_deg, config.grid_axes):
+            turned = pose.copy()
+            turned[:3, :3] = turn @ pose[:3, :3]
+            turned[:3, 3] = middle - turned[:3, :3] @ scene.center_m
+            tries.append(turned)
+    rough = [_aligned(scene, h, i, t, config.grid, config, "grid") for t in tries]
+    rough = _merged([c for c in rough if c is not None], config)[:8]
+    return _refined(scene, h, i, rough, config)
+
+
+def _aligned_all(
+    scene: Scene, h: Hypothesis, i: int, starts: list[tuple[str, Float[Array, "4 4"]]], config: BeamConfig
+) -> list[Candidate]:
+    coarse = [_aligned(scene, h, i, pose, config.coarse, config, name) for name, pose in starts]
+    return _refined(scene, h, i, _merged([c for c in coarse if c is not None], config)[:4], config)
+
+
+def _refined(scene: Scene, h: Hypothesis, i: int, rough: list[Candidate], config: BeamConfig) -> list[Candidate]:
+    fine = [_aligned(scene, h, i, c.pose, config.fine, config, c.source) for c in rough]
+    return _merged([c for c in fine if c is not None], config)
+
+
+def _merged(candidates: list[Candidate], config: BeamConfig) -> list[Candidate]:
+    """Sorted by cost, without those that say the same as a better one."""
+    kept: list[Candidate] = []
+    for c in sorted(candidates, key=lambda c: c.cost):
+        if all(np.degrees(np.linalg.norm(turn_between(c.pose, o.pose))) > config.apart_deg for o in kept):
+            kept.append(c)
+    return kept
+
+
+def _aligned(
+    scene: Scene, h: Hypothesis, i: int, pose: Float[Array, "4 4"], schedule: Schedule, config: BeamConfig, source: str
+) -> Candidate | None:
+    """One candidate aligned to the nearest views of the model; None where nothing faces it."""
+    refs = references(h.poses, h.keyframes, h.tracked[-1], pose, scene.center_m, config.keyframes)
+    if len(refs) == 0:
+        return None
+    store = scene.store
+    distance = float(np.linalg.norm(store.center_m[i]))
+    aligned, _, fit, on, _ = k.align_view(
+        np.ascontiguousarray(pose), i, refs, np.ascontiguousarray(h.poses[refs]), store.maps, store.samples, store.table,
+        store.optics.focal, store.optics.center, rows(schedule, distance), np.zeros(6), np.eye(4),
+    )  # fmt: skip
+    if not np.isfinite(aligned).all():
+        return None
+    return Candidate(aligned, float(fit), _price(scene, h, i, aligned, config), float(on), source)
+
+
+def _price(scene: Scene, h: Hypothesis, i: int, pose: Float[Array, "4 4"], config: BeamConfig) -> float:
+    tracked = h.tracked
+    times = scene.times_s
+    if len(tracked) < 2:
+        spin = np.linalg.norm(turn_between(pose, h.poses[tracked[-1]])) / max(abs(times[i] - times[tracked[-1]]), 1e-3)
+        ratio = (float(spin) / config.motion.usual_turn_rad_s) ** 2
+        return config.motion.impact_cost * ratio / (1 + ratio)
+    a, b = tracked[-2], tracked[-1]
+    three = (h.poses[a], h.poses[b], pose)
+    steps = (times[b] - times[a], times[i] - times[b])
+    return change_cost(three, steps, scene.center_m, scene.gravity_camera_m_s2, config.motion)
+
+

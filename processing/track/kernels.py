@@ -1,0 +1,400 @@
+"""Compiled kernels of the tracker: smooth depth and normals of a view, and the residuals of one view against another.
+
+A view is a crop of the rectified (pinhole) image with CHANNELS values a pixel, stored in one flat array for all views of
+a toss, and a few hundred sampled surface points. `table` says where each view's pixels and samples lie. Poses are
+4x4 `camera_from_object`; corrections are twists (translation, rotation) of the object frame, applied on its left:
+object_from_camera <- exp(twist) object_from_camera.
+"""
+
+from __future__ import annotations
+
+from typing import no_type_check
+
+import numpy as np
+from numba import njit
+
+Z, NX, NY, NZ, OUTSIDE, SHARP, SMOOTH = range(7)
+CHANNELS = 7
+HIDDEN = -1.0
+"""OUTSIDE holds the distance to the mask in pixels (0 inside), or HIDDEN where something nearer may cover the object."""
+
+OFFSET, U0, V0, WIDTH, HEIGHT, FIRST, COUNT = range(7)
+"""Columns of the view table: first pixel, crop corner and size, first sample and number of samples."""
+
+PX, PY, PZ, SNX, SNY, SNZ, SSHARP, SSMOOTH = range(8)
+"""Columns of a sample: point and normal in its camera's frame (m), and its two intensities."""
+
+LEVEL, STEPS, GEOMETRY_M, INTENSITY, OUTLINE_M, SHARE = range(6)
+"""Columns of a schedule row: intensity channel (0 sharp, 1 smooth), steps, the three scales, share of the samples."""
+
+NEUTRAL_COST = 0.3
+"""Of a point that the other view cannot judge: what a well fitting point costs on a bad day."""
+
+
+@no_type_check
+@njit(cache=True, nogil=True, fastmath=True)
+def fit_surface(depth_m, inside, rays, radius, edge_share, out_m, normals):
+    """Local planes, fitted to inverse depth (in which planes stay planes) over a window, twice: the second time
+    without what lies off the first plane. Fills small holes. Writes depth and normal, 0 where there is no plane."""
+    h, w = depth_m.shape
+    for v in range(h):
+        for u in range(w):
+            out_m[v, u] = 0.0
+            if not inside[v, u]:
+                continue
+            z0 = depth_m[v, u]
+            if z0 <= 0.0:
+                total, n = 0.0, 0
+                for dv in range(-1, 2):
+                    for du in range(-1, 2):
+                        y, x = v + dv, u + du
+                        if 0 <= y < h and 0 <= x < w and inside[y, x] and depth_m[y, x] > 0:
+                            total += depth_m[y, x]
+                            n += 1
+                if n < 3:
+                    continue
+                z0 = total / n
+            q0 = 1.0 / z0
+            a, b, c = q0, 0.0, 0.0
+            good = False
+            for again in range(2):
+                limit = edge_share * z0 * (1.5 if again == 0 else 0.5)
+                s = sx = sy = sxx = sxy = syy = sq = sqx = sqy = 0.0
+                for dv in range(-radius, radius + 1):
+                    for du in range(-radius, radius + 1):
+                        y, x = v + dv, u + du
+                        if y < 0 or x < 0 or y >= h or x >= w or not inside[y, x]:
+                            continue
+                        z = depth_m[y, x]
+                        if z <= 0.0:
+                            continue
+                        q = 1.0 / z
+                        gap = (q - (a + b * du + c * dv)) * z * z0
+                        if abs(gap) > limit:
+                            continue
+                        k = 1.0 - (abs(gap) / limit) ** 2
+                        s += k
+                        sx += k * du
+                        sy += k * dv
+                        sxx += k * du * du
+                        sxy += k * du * dv
+                        syy += k * dv * dv
+                        e = q - q0
+                        sq += k * e
+                        sqx += k * e * du
+                        sqy += k * e * dv
+                if s < 6.0:
+                    good = False
+                    break
+                mx, my, mq = sx / s, sy / s, sq / s
+                cxx, cxy, cyy = sxx / s - mx * mx, sxy / s - mx * my, syy / s - my * my
+                cqx, cqy = sqx / s - mq * mx, sqy / s - mq * my
+                det = cxx * cyy - cxy * cxy
+                if det < 0.05:
+                    good = False
+                    break
+                b = (cqx * cyy - cqy * cxy) / det
+                c = (cqy * cxx - cqx * cxy) / det
+                a = q0 + mq - b * mx - c * my
+                good = True
+            if not good or a <= 0.0:
+                continue
+            # 1/z = n . ray / d: the plane's normal follows from the slopes of 1/z per ray coordinate
+            dx = rays[0]
+            dy = rays[1]
+            x = rays[2] + u * dx
+            y = rays[3] + v * dy
+            n0, n1 = b / dx, c / dy
+            n2 = a - n0 * x - n1 * y
+            length = np.sqrt(n0 * n0 + n1 * n1 + n2 * n2)
+            cosine = a / (length * np.sqrt(x * x + y * y + 1.0))
+            if cosine < 0.12:  # grazing: flying pixels, not a surface
+                continue
+            out_m[v, u] = 1.0 / a
+            normals[v, u, 0] = -n0 / length
+            normals[v, u, 1] = -n1 / length
+            normals[v, u, 2] = -n2 / length
+
+
+@no_type_check
+@njit(cache=True, nogil=True, fastmath=True)
+def pair_terms(samples, step, pose, maps, row, focal, center, level, s_geo, s_int, s_out, H, g):
+    """Adds normal equations of `samples` (of one camera) seen by another view, in that view's camera frame.
+
+    pose: 4x4 other_from_sample_camera. H (6, 6), g (6): J^T W J and J^T W r for a twist (translation, rotation) of the
+    points in the other camera's frame. Returns cost sum, points counted, points on the surface, violations.
+    """
+    off, u0, v0, w, h = row[OFFSET], row[U0], row[V0], row[WIDTH], row[HEIGHT]
+    fx, fy, cx, cy = focal[0], focal[1], center[0], center[1]
+    cost = 0.0
+    seen = 0
+    on = 0
+    against = 0
+    J = np.empty(6)
+    wg, wi, wo = 1.0 / (s_geo * s_geo), 1.0 / (s_int * s_int), 1.0 / (s_out * s_out)
+    for i in range(0, samples.shape[0], step):
+        p = samples[i]
+        x = pose[0, 0] * p[PX] + pose[0, 1] * p[PY] + pose[0, 2] * p[PZ] + pose[0, 3]
+        y = pose[1, 0] * p[PX] + pose[1, 1] * p[PY] + pose[1, 2] * p[PZ] + pose[1, 3]
+        z = pose[2, 0] * p[PX] + pose[2, 1] * p[PY] + pose[2, 2] * p[PZ] + pose[2, 3]
+        seen += 1
+        if z < 0.05:
+            cost += 1.0
+            continue
+        iz = 1.0 / z
+        u = fx * x * iz + cx - u0
+        v = fy * y * iz + cy - v0
+        iu, iv = int(np.floor(u + 0.5)), int(np.floor(v + 0.5))
+        if iu < 1 or iv < 1 or iu >= w - 2 or iv >= h - 2:
+            cost += 1.0
+            against += 1
+            continue
+        near = off + iv * w + iu
+        out = maps[near, OUTSIDE]
+        if out < 0.0:
+            cost += NEUTRAL_COST
+            continue
+        if out > 0.0:
+            gap = out * z / fx
+            r = gap / s_out
+            cost += min(r * r / 9.0, 1.0)
+            against += 1
+            if r < 6.0 and s_out < 1.0:
+                k = wo / (1.0 + r * r / 4.0)
+                du = 0.5 * (max(maps[near + 1, OUTSIDE], 0.0) - max(maps[near - 1, OUTSIDE], 0.0))
+                dv = 0.5 * (max(maps[near + w, OUTSIDE], 0.0) - max(maps[near - w, OUTSIDE], 0.0))
+                J[0], J[1] = du, dv * fy / fx
+                J[2] = -(du * x + dv * fy / fx * y) * iz
+                _add(J, x, y, z, gap, k, H, g)
+            continue
+        zr = maps[near, Z]
+        nx, ny, nz = maps[near, NX], maps[near, NY], maps[near, NZ]
+        fits = False
+        facing = 0.0
+        if zr <= 0.0:
+            cost += 0.5 * NEUTRAL_COST
+            fits = True
+        else:
+            ju, jv = int(np.floor(u)), int(np.floor(v))
+            a, b = u - ju, v - jv
+            q = off + jv * w + ju
+            z00, z10, z01, z11 = maps[q, Z], maps[q + 1, Z], maps[q + w, Z], maps[q + w + 1, Z]
+            low = min(min(z00, z10), min(z01, z11))
+            high = max(max(z00, z10), max(z01, z11))
+            if low > 0.0 and high - low < 0.012:
+                zr = (z00 * (1 - a) + z10 * a) * (1 - b) + (z01 * (1 - a) + z11 * a) * b
+            else:  # follow the nearest pixel's plane to the sub-pixel place
+                px, py = (iu + u0 - cx) / fx, (iv + v0 - cy) / fy
+                top = nx * px + ny * py + nz
+                bottom = nx * x * iz + ny * y * iz + nz
+                if abs(bottom) > 0.05:
+                    zr = zr * top / bottom
+            ahead = zr - z  # positive: the point lies in front of what this view sees
+            facing = (
+                nx * (pose[0, 0] * p[SNX] + pose[0, 1] * p[SNY] + pose[0, 2] * p[SNZ])
+                + ny * (pose[1, 0] * p[SNX] + pose[1, 1] * p[SNY] + pose[1, 2] * p[SNZ])
+                + nz * (pose[2, 0] * p[SNX] + pose[2, 1] * p[SNY] + pose[2, 2] * p[SNZ])
+            )
+            r_m = (nx * x + ny * y + nz * z) * (1.0 - zr * iz)
+            r = r_m / s_geo
+            if abs(r) < 3.0 and facing > 0.5:
+                fits = True
+                on += 1
+                k = 1.0 - r * r / 9.0
+                J[0], J[1], J[2] = nx, ny, nz
+                _add(J, x, y, z, r_m, wg * k * k, H, g)
+                cost += 0.5 * min(r * r / 9.0, 1.0)
+            elif ahead > 3.0 * s_geo:
+                cost += min(0.5 + ahead / (12.0 * s_geo), 1.0)
+                against += 1
+            else:
+                cost += NEUTRAL_COST if ahead < -3.0 * s_geo else 0.5
+        if fits:
+            ju, jv = int(np.floor(u)), int(np.floor(v))
+            a, b = u - ju, v - jv
+            q = off + jv * w + ju
+            ch = SHARP + level
+            i00, i10, i01, i11 = maps[q, ch], maps[q + 1, ch], maps[q + w, ch], maps[q + w + 1, ch]
+            top, bottom = i00 * (1 - a) + i10 * a, i01 * (1 - a) + i11 * a
+            e = top * (1 - b) + bottom * b - p[SSHARP + level]
+            r = e / s_int
+            cost += 0.5 * min(r * r / 9.0, 1.0)
+            if abs(r) < 3.0:
+                k = 1.0 - r * r / 9.0
+                gu = ((i10 - i00) * (1 - b) + (i11 - i01) * b) * fx * iz
+                gv = (bottom - top) * fy * iz
+                J[0], J[1] = gu, gv
+                J[2] = -(gu * x + gv * y) * iz
+                _add(J, x, y, z, e, wi * k * k, H, g)
+    return cost, seen, on, against
+
+
+@no_type_check
+@njit(cache=True, nogil=True, fastmath=True, inline="always")
+def _add(J, x, y, z, r, weight, H, g):
+    """One residual whose derivative by the point is J[:3]."""
+    J[3] = y * J[2] - z * J[1]
+    J[4] = z * J[0] - x * J[2]
+    J[5] = x * J[1] - y * J[0]
+    for a in range(6):
+        ja = weight * J[a]
+        g[a] += ja * r
+        for b in range(a + 1):
+            H[a, b] += ja * J[b]
+
+
+@no_type_check
+@njit(cache=True, nogil=True)
+def to_object(H, g, pose, sign, H_out, g_out):
+    """Adds normal equations of a camera frame to those of the object frame: twist_camera = sign * A twist_object.
+
+    pose: 4x4 camera_from_object. H has its lower triangle only.
+    """
+    A = np.zeros((6, 6))
+    for i in range(3):
+        for j in range(3):
+            A[i, j] = pose[i, j]
+            A[i + 3, j + 3] = pose[i, j]
+    t = pose[:3, 3]
+    for j in range(3):
+        A[0, j + 3] = t[1] * pose[2, j] - t[2] * pose[1, j]
+        A[1, j + 3] = t[2] * pose[0, j] - t[0] * pose[2, j]
+        A[2, j + 3] = t[0] * pose[1, j] - t[1] * pose[0, j]
+    full = np.empty((6, 6))
+    for a in range(6):
+        for b in range(a + 1):
+            full[a, b] = H[a, b]
+            full[b, a] = H[a, b]
+    H_out += A.T @ full @ A
+    g_out += sign * (A.T @ g)
+
+
+@no_type_check
+@njit(cache=True, nogil=True)
+def inverse(pose):
+    out = np.eye(4)
+    out[:3, :3] = pose[:3, :3].T
+    out[:3, 3] = -(out[:3, :3] @ np.ascontiguousarray(pose[:3, 3]))
+    return out
+
+
+@no_type_check
+@njit(cache=True, nogil=True)
+def exponential(twist):
+    """4x4 of a twist (translation, rotation): the translation is taken as it is."""
+    out = np.eye(4)
+    angle = np.sqrt(twist[3] ** 2 + twist[4] ** 2 + twist[5] ** 2)
+    s = 1.0 - angle * angle / 6.0 if angle < 1e-4 else np.sin(angle) / angle
+    c = 0.5 - angle * angle / 24.0 if angle < 1e-4 else (1.0 - np.cos(angle)) / (angle * angle)
+    K = np.zeros((3, 3))
+    K[0, 1], K[0, 2], K[1, 2] = -twist[5], twist[4], -twist[3]
+    K[1, 0], K[2, 0], K[2, 1] = twist[5], -twist[4], twist[3]
+    out[:3, :3] += s * K + c * (K @ K)
+    out[:3, 3] = twist[:3]
+    return out
+
+
+@no_type_check
+@njit(cache=True, nogil=True)
+def view_terms(pose, view, refs, ref_poses, maps, samples, table, focal, center, row, H, g):
+    """Normal equations of one view's pose against reference views, both ways: its points in their images, theirs in
+    its image. Returns mean cost, share of points on the surface, share of violations."""
+    level = int(row[LEVEL])
+    step = max(1, int(np.round(1.0 / row[SHARE])))
+    mine = samples[table[view, FIRST] : table[view, FIRST] + table[view, COUNT]]
+    back = inverse(pose)
+    cost, seen, on, against = 0.0, 0, 0, 0
+    h6, g6 = np.empty((6, 6)), np.empty(6)
+    for k in range(refs.shape[0]):
+        ref_pose = ref_poses[k]
+        other = table[refs[k]]
+        h6[:], g6[:] = 0.0, 0.0
+        c, s, o, v = pair_terms(
+            mine, step, ref_pose @ back, maps, other, focal, center, level, row[GEOMETRY_M], row[INTENSITY],
+            row[OUTLINE_M], h6, g6,
+        )  # fmt: skip
+        to_object(h6, g6, ref_pose, 1.0, H, g)
+        cost, seen, on, against = cost + c, seen + s, on + o, against + v
+        theirs = samples[other[FIRST] : other[FIRST] + other[COUNT]]
+        h6[:], g6[:] = 0.0, 0.0
+        c, s, o, v = pair_terms(
+            theirs, 2 * step, pose @ inverse(ref_pose), maps, table[view], focal, center, level, row[GEOMETRY_M],
+            row[INTENSITY], row[OUTLINE_M], h6, g6,
+        )  # fmt: skip
+        to_object(h6, g6, pose, -1.0, H, g)
+        cost, seen, on, against = cost + c, seen + s, on + o, against + v
+    n = max(1, seen)
+    return cost / n, on / n, against / n
+
+
+@no_type_check
+@njit(cache=True, nogil=True)
+def align_view(pose, view, refs, ref_poses, maps, samples, table, focal, center, schedule, prior, prior_pose):
+    """Gauss-Newton of one view's pose (camera_from_object) against fixed reference views, coarse to fine.
+
+    prior (6,): information of a pull towards prior_pose (translation, rotation, object frame). Returns pose, H of the
+    last step, cost, share on the surface, share of violations; the figures are at the last schedule row's scales.
+    """
+    pose = pose.copy()
+    H, g = np.zeros((6, 6)), np.zeros(6)
+    cost, on, against = 1.0, 0.0, 0.0
+    for level in range(schedule.shape[0]):
+        row = schedule[level]
+        for _ in range(int(row[STEPS])):
+            H[:], g[:] = 0.0, 0.0
+            view_terms(pose, view, refs, ref_poses, maps, samples, table, focal, center, row, H, g)
+            if prior[0] > 0.0:
+                _pull(pose, prior_pose, prior, H, g)
+            damp = 0.0
+            for a in range(6):
+                damp += H[a, a] / 6.0
+            for a in range(6):
+                H[a, a] += 1e-5 * H[a, a] + 1e-9 * damp + 1e-9
+            step = -np.linalg.solve(H, g)
+            turn = np.sqrt(step[3] ** 2 + step[4] ** 2 + step[5] ** 2)
+            shift = np.sqrt(step[0] ** 2 + step[1] ** 2 + step[2] ** 2)
+            scale = min(1.0, min(0.3 / max(turn, 1e-12), 0.04 / max(shift, 1e-12)))
+            pose = pose @ inverse(exponential(scale * step))
+            if shift < 3e-5 and turn < 3e-4:
+                break
+    H[:], g[:] = 0.0, 0.0
+    row = schedule[schedule.shape[0] - 1]
+    cost, on, against = view_terms(pose, view, refs, ref_poses, maps, samples, table, focal, center, row, H, g)
+    return pose, H, cost, on, against
+
+
+@no_type_check
+@njit(cache=True, nogil=True)
+def _pull(pose, wanted, information, H, g):
+    """Adds a pull of `pose` towards `wanted`, to first order in their difference (object frame)."""
+    gap = inverse(pose) @ wanted  # object_from_object: where the wanted pose's points lie from here
+    r = np.empty(6)
+    r[0], r[1], r[2] = gap[0, 3], gap[1, 3], gap[2, 3]
+    r[3] = 0.5 * (gap[2, 1] - gap[1, 2])
+    r[4] = 0.5 * (gap[0, 2] - gap[2, 0])
+    r[5] = 0.5 * (gap[1, 0] - gap[0, 1])
+    for a in range(6):
+        H[a, a] += information[a]
+        g[a] += information[a] * r[a]
+
+
+@no_type_check
+@njit(cache=True, nogil=True)
+def graph_terms(poses, pairs, maps, samples, table, focal, center, row, blocks, gradients, figures):
+    """Normal equations of each pair (i, k): points of view i in view k. blocks (m, 6, 6), gradients (m, 6) for the twist
+    of i; that of k has the opposite sign. figures (m, 3): mean cost, share on the surface, share of violations."""
+    level = int(row[LEVEL])
+    step = max(1, int(np.round(1.0 / row[SHARE])))
+    h6, g6 = np.empty((6, 6)), np.empty(6)
+    for m in range(pairs.shape[0]):
+        i, k = pairs[m, 0], pairs[m, 1]
+        h6[:], g6[:] = 0.0, 0.0
+        mine = samples[table[i, FIRST] : table[i, FIRST] + table[i, COUNT]]
+        c, s, o, v = pair_terms(
+            mine, step, poses[k] @ inverse(poses[i]), maps, table[k], focal, center, level, row[GEOMETRY_M],
+            row[INTENSITY], row[OUTLINE_M], h6, g6,
+        )  # fmt: skip
+        blocks[m], gradients[m] = 0.0, 0.0
+        to_object(h6, g6, poses[k], 1.0, blocks[m], gradients[m])
+        n = max(1, s)
+        figures[m, 0], figures[m, 1], figures[m, 2] = c / n, o / n, v / n

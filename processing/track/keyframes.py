@@ -1,0 +1,73 @@
+"""The memory pool: which views serve as the model, and which of them a new view is compared with."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+from numpy import ndarray as Array
+
+
+@dataclass(frozen=True)
+class KeyframeConfig:
+    """When a view joins the pool and how many of the pool are used at once."""
+
+    apart_deg: float = 8.0
+    """A view joins when no keyframe is within this turn of it."""
+    nearer: float = 0.85
+    """... or when it is this much nearer than the keyframes around."""
+    used: int = 4
+    """Views that a new one is compared with."""
+    co_visible_deg: float = 65.0
+    """Views from directions farther apart share too little surface."""
+
+
+def view_directions(poses: Float[Array, "n 4 4"], center_m: Float[Array, "3"]) -> Float[Array, "n 3"]:
+    """Unit vectors from the body's middle to the camera, object frame."""
+    middle = poses[:, :3, :3] @ center_m + poses[:, :3, 3]
+    direction = -np.einsum("nji,nj->ni", poses[:, :3, :3], middle)
+    return np.asarray(direction / np.linalg.norm(direction, axis=1, keepdims=True))
+
+
+def turns_deg(poses: Float[Array, "n 4 4"], pose: Float[Array, "4 4"]) -> Float[Array, " n"]:
+    """Rotation angle between each pose and one, degrees."""
+    cosine = (np.einsum("nij,ij->n", poses[:, :3, :3], pose[:3, :3]) - 1) / 2
+    return np.asarray(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
+
+
+def is_new(
+    poses: Float[Array, "n 4 4"],
+    view: int,
+    keyframes: tuple[int, ...],
+    center_m: Float[Array, "3"],
+    config: KeyframeConfig,
+) -> bool:
+    """Whether `view` shows what no keyframe shows: another turn, or the same from much nearer."""
+    keys = np.array(keyframes)
+    near = turns_deg(poses[keys], poses[view]) < config.apart_deg
+    if not near.any():
+        return True
+    depth = poses[keys][near][:, :3, 3][:, 2].min()
+    return bool(poses[view, 2, 3] < config.nearer * depth)
+
+
+def references(
+    poses: Float[Array, "n 4 4"],
+    keyframes: tuple[int, ...],
+    last: int,
+    pose: Float[Array, "4 4"],
+    center_m: Float[Array, "3"],
+    config: KeyframeConfig,
+) -> Int[Array, " m"]:
+    """Views to compare a view at `pose` with: the last one and the keyframes that look from the nearest directions."""
+    pool = np.array(sorted({*keyframes, last}))
+    directions = view_directions(poses[pool], center_m)
+    here = view_directions(pose[None], center_m)[0]
+    angle = np.degrees(np.arccos(np.clip(directions @ here, -1, 1)))
+    order = np.argsort(angle + 0.05 * turns_deg(poses[pool], pose))
+    order = order[angle[order] < config.co_visible_deg][: config.used]
+    chosen = pool[order]
+    if last not in chosen and angle[pool == last][0] < config.co_visible_deg:
+        chosen = np.concatenate([chosen[: config.used - 1], [last]])
+    return np.asarray(chosen, dtype=np.int64)

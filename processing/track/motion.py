@@ -1,0 +1,93 @@
+"""How a tossed body moves between frames: ballistic centre, constant spin, and what an impact may cost."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray as Array
+
+from recordings.geometry import rotation_exp, rotation_log
+
+GRAVITY_M_S2 = 9.81
+
+
+@dataclass(frozen=True)
+class MotionConfig:
+    """What counts as a usual change of motion from frame to frame."""
+
+    usual_turn_rad_s: float = 6.0
+    """Change of spin between two frames that costs half of an impact's price."""
+    impact_cost: float = 0.12
+    """Price of a change of spin, however large: an impact may do anything."""
+    fast_turn_rad_s: float = 28.0
+    """Spins above this are dearer still (an alias of a symmetric body is a fast spin)."""
+    usual_shift_m_s: float = 0.6
+    """Change of velocity, beyond gravity, that costs half of the price below."""
+    shift_cost: float = 0.04
+
+
+def turn_between(after: Float[Array, "4 4"], before: Float[Array, "4 4"]) -> Float[Array, "3"]:
+    """Rotation vector (camera frame) from one pose to a later one."""
+    return rotation_log(after[:3, :3] @ before[:3, :3].T)
+
+
+def moved(
+    before: Float[Array, "4 4"],
+    now: Float[Array, "4 4"],
+    step_s: float,
+    next_s: float,
+    center_m: Float[Array, "3"],
+    gravity_camera_m_s2: Float[Array, "3"],
+) -> Float[Array, "4 4"]:
+    """The pose `next_s` after `now`, `before` being `step_s` earlier: constant spin, ballistic centre (object frame)."""
+    ratio = next_s / step_s
+    out = np.eye(4)
+    out[:3, :3] = rotation_exp(turn_between(now, before) * ratio) @ now[:3, :3]
+    x0, x1 = (p[:3, :3] @ center_m + p[:3, 3] for p in (before, now))
+    center = x1 + (x1 - x0) * ratio + gravity_camera_m_s2 * (0.5 * next_s * (step_s + next_s))
+    out[:3, 3] = center - out[:3, :3] @ center_m
+    return out
+
+
+def between(
+    before: Float[Array, "4 4"], after: Float[Array, "4 4"], share: float, center_m: Float[Array, "3"]
+) -> Float[Array, "4 4"]:
+    """The pose at `share` (0..1) of the way: constant spin, straight centre."""
+    out = np.eye(4)
+    out[:3, :3] = rotation_exp(turn_between(after, before) * share) @ before[:3, :3]
+    x0, x1 = (p[:3, :3] @ center_m + p[:3, 3] for p in (before, after))
+    out[:3, 3] = x0 + share * (x1 - x0) - out[:3, :3] @ center_m
+    return out
+
+
+def change_cost(
+    poses: tuple[Float[Array, "4 4"], Float[Array, "4 4"], Float[Array, "4 4"]],
+    steps_s: tuple[float, float],
+    center_m: Float[Array, "3"],
+    gravity_camera_m_s2: Float[Array, "3"],
+    config: MotionConfig,
+) -> float:
+    """Price of the change of motion over three poses, at most impact_cost + shift_cost (and more for very fast spins).
+
+    Zero for a body in free flight with constant spin, and (but for gravity's share) for one at rest.
+    """
+    first, second, third = poses
+    spin0 = turn_between(second, first) / steps_s[0]
+    spin1 = turn_between(third, second) / steps_s[1]
+    x0, x1, x2 = (p[:3, :3] @ center_m + p[:3, 3] for p in poses)
+    free = (x2 - x1) / steps_s[1] - (x1 - x0) / steps_s[0]
+    flight = gravity_camera_m_s2 * 0.5 * (steps_s[0] + steps_s[1])
+    change = min(float(np.linalg.norm(free - flight)), float(np.linalg.norm(free)))
+    turn = (float(np.linalg.norm(spin1 - spin0)) / config.usual_turn_rad_s) ** 2
+    shift = (change / config.usual_shift_m_s) ** 2
+    excess = max(0.0, float(np.linalg.norm(spin1)) / config.fast_turn_rad_s - 1.0)
+    return config.impact_cost * (turn / (1.0 + turn) + excess) + config.shift_cost * shift / (1.0 + shift)
+
+
+def gravity_in_camera(world_from_camera: Float[Array, "4 4"] | None) -> Float[Array, "3"]:
+    """Gravity in the camera's axes; zero where the world is not known."""
+    if world_from_camera is None:
+        return np.zeros(3)
+    return world_from_camera[:3, :3].T @ np.array([0.0, 0.0, -GRAVITY_M_S2])

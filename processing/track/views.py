@@ -1,0 +1,348 @@
+"""What one frame shows of the object, made ready for alignment: smooth depth, normals, two grey levels, outline, samples.
+
+All views of a toss lie in flat arrays (see kernels.py), so that any view can serve as the model for any other: the
+growing model is the set of views at their poses. Nothing is averaged away, nothing limits the object's size, and a
+corrected pose corrects the model.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int64, UInt8
+from numpy import ndarray as Array
+
+from processing.track import kernels as k
+from recordings.geometry import CameraModel
+from recordings.records import RgbdFrame
+
+
+@dataclass(frozen=True)
+class ViewConfig:
+    """How a frame is turned into a view."""
+
+    margin_px: int = 14
+    """Rim of the crop around the mask: how far outside the outline still has a slope."""
+    window_px: int = 3
+    """Half width of the window in which depth is fitted by planes."""
+    edge_share: float = 0.012
+    """Depth off a plane by more than this share of the distance belongs to another surface."""
+    smooth_px: float = 2.5
+    """Blur of the smooth grey level, which widens the basin of attraction."""
+    shade_px: float = 9.0
+    """Scale over which brightness is levelled: shading and exposure are no texture."""
+    samples: int = 500
+    """Surface points of a view that alignment uses."""
+    least_samples: int = 40
+    """A view with fewer cannot be tracked."""
+    cover_m: float = 0.015
+    """What is nearer than the object by this may cover it."""
+    above_table_m: float = 0.02
+    """What is lower above the table than this is the table, which covers nothing."""
+
+
+@dataclass(frozen=True, eq=False)
+class Optics:
+    """A camera as an ideal pinhole, with the maps that undo its distortion (None where it has none)."""
+
+    camera: CameraModel
+    map_u: Float32[Array, "h w"] | None
+    map_v: Float32[Array, "h w"] | None
+
+    @staticmethod
+    def of(camera: CameraModel) -> Optics:
+        if camera.distortion_model == "none":
+            return Optics(camera, None, None)
+        u, v = np.meshgrid(np.arange(camera.width, dtype=np.float64), np.arange(camera.height, dtype=np.float64))
+        rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], -1)
+        pixels = np.nan_to_num(camera.project(rays), nan=-1e4)
+        return Optics(camera, pixels[..., 0].astype(np.float32), pixels[..., 1].astype(np.float32))
+
+    @property
+    def focal(self) -> Float[Array, "2"]:
+        return np.array([self.camera.fx, self.camera.fy])
+
+    @property
+    def center(self) -> Float[Array, "2"]:
+        return np.array([self.camera.cx, self.camera.cy])
+
+    def straight(self, image: Array, smooth: bool) -> Array:
+        """The image as the pinhole would see it."""
+        if self.map_u is None or self.map_v is None:
+            return image
+        return cv2.remap(image, self.map_u, self.map_v, cv2.INTER_LINEAR if smooth else cv2.INTER_NEAREST)
+
+
+@dataclass(frozen=True, eq=False)
+class Crop:
+    """The rectified pixels around the object in one frame: all that later steps need of it."""
+
+    position: int
+    corner: tuple[int, int]
+    """u, v of the crop's first pixel."""
+    mask: Bool[Array, "h w"]
+    depth_m: Float32[Array, "h w"]
+    gray: Float32[Array, "h w"]
+    """Brightness 0..1 at the session's usual exposure."""
+    covered: Bool[Array, "h w"]
+    """Pixels outside the mask where something nearer may hide the object."""
+    height_m: Float32[Array, "h w"] | None
+    depth_delay_s: float
+    """Depth's exposure time minus colour's."""
+
+
+def cut(
+    frame: RgbdFrame,
+    mask: Bool[Array, "h w"],
+    position: int,
+    optics: Optics,
+    gain: float,
+    config: ViewConfig,
+    camera_from_world: Float[Array, "4 4"] | None = None,
+) -> Crop | None:
+    """The crop around the mask, or None where the mask holds too little. `camera_from_world` has the table at z = 0."""
+    straight_mask = optics.straight(mask.astype(np.uint8), smooth=False) > 0
+    rows, columns = np.flatnonzero(straight_mask.any(1)), np.flatnonzero(straight_mask.any(0))
+    if len(rows) == 0 or int(straight_mask.sum()) < config.least_samples:
+        return None
+    h, w = straight_mask.shape
+    top, bottom = max(rows[0] - config.margin_px, 0), min(rows[-1] + config.margin_px + 1, h)
+    left, right = max(columns[0] - config.margin_px, 0), min(columns[-1] + config.margin_px + 1, w)
+    area = np.s_[top:bottom, left:right]
+    gray = cv2.cvtColor(frame.color_rgb, cv2.COLOR_RGB2GRAY)
+    gray = optics.straight(gray, smooth=True)[area].astype(np.float32) / np.float32(255.0 * gain)
+    depth_m = np.ascontiguousarray(optics.straight(frame.depth_m, smooth=False)[area])
+    inside = np.ascontiguousarray(straight_mask[area])
+    height_m = _heights(depth_m, (left, top), optics, camera_from_world)
+    covered = _covered(depth_m, inside, height_m, config)
+    delay_s = (frame.depth_time_ns - frame.time_ns) * 1e-9
+    return Crop(position, (int(left), int(top)), inside, depth_m, gray, covered, height_m, delay_s)
+
+
+def _heights(
+    depth_m: Float32[Array, "h w"],
+    corner: tuple[int, int],
+    optics: Optics,
+    camera_from_world: Float[Array, "4 4"] | None,
+) -> Float32[Array, "h w"] | None:
+    """Height above the table of every pixel; None where the table is not known."""
+    if camera_from_world is None:
+        return None
+    up = camera_from_world[:3, 2]
+    v, u = np.indices(depth_m.shape)
+    x = (u + corner[0] - optics.camera.cx) / optics.camera.fx
+    y = (v + corner[1] - optics.camera.cy) / optics.camera.fy
+    height = depth_m * (up[0] * x + up[1] * y + up[2]) - up @ camera_from_world[:3, 3]
+    return height.astype(np.float32)
+
+
+def _covered(
+    depth_m: Float32[Array, "h w"],
+    inside: Bool[Array, "h w"],
+    height_m: Float32[Array, "h w"] | None,
+    config: ViewConfig,
+) -> Bool[Array, "h w"]:
+    """Where something nearer than the object's nearest mask pixel stands, the table excepted."""
+    seen = inside & (depth_m > 0)
+    if not seen.any():
+        return np.zeros_like(inside)
+    _, label = cv2.distanceTransformWithLabels((~seen).astype(np.uint8), cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL)
+    by_label = np.zeros(int(label.max()) + 1, dtype=np.float32)
+    by_label[label[seen]] = depth_m[seen]
+    covered = ~inside & (depth_m > 0) & (depth_m < by_label[label] - config.cover_m)
+    if height_m is not None:
+        covered &= height_m > config.above_table_m
+    return np.asarray(covered)
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """One view: `pixels` (h, w, CHANNELS) and `samples` (n, 8) as kernels.py has them."""
+
+    position: int
+    corner: tuple[int, int]
+    pixels: Float32[Array, "h w 7"]
+    samples: Float32[Array, "n 8"]
+
+    @property
+    def center_m(self) -> Float[Array, "3"]:
+        """Middle of the seen surface, camera frame."""
+        return np.asarray(np.median(self.samples[:, :3], axis=0), dtype=np.float64)
+
+
+def make_view(crop: Crop, optics: Optics, config: ViewConfig, motion: Float[Array, "4 4"] | None = None) -> View | None:
+    """Depth made smooth, normals, levelled grey, distance to the outline, samples.
+
+    `motion` (4x4, camera frame) moves the object from its place at depth's exposure to that at colour's; None: at rest.
+    None is returned where too few points are left.
+    """
+    depth_m = _cleaned(crop, config) if motion is None else _moved_depth(crop, optics, motion, config)
+    inside = cv2.erode(crop.mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    h, w = crop.mask.shape
+    pixels = np.zeros((h, w, k.CHANNELS), dtype=np.float32)
+    rays = _ray_steps(crop.corner, optics)
+    smooth_m, normals = np.zeros((h, w), dtype=np.float32), np.zeros((h, w, 3), dtype=np.float32)
+    k.fit_surface(depth_m, inside, rays, config.window_px, config.edge_share, smooth_m, normals)
+    pixels[..., k.Z], pixels[..., k.NX : k.NZ + 1] = smooth_m, normals
+    outside = cv2.distanceTransform((~crop.mask).astype(np.uint8), cv2.DIST_L2, 5)
+    pixels[..., k.OUTSIDE] = np.where(crop.covered, k.HIDDEN, outside)
+    pixels[..., k.SHARP], pixels[..., k.SMOOTH] = _levels(crop.gray, crop.mask, config)
+    samples = _samples(pixels, rays, config, crop.position)
+    return View(crop.position, crop.corner, pixels, samples) if len(samples) >= config.least_samples else None
+
+
+def _ray_steps(corner: tuple[int, int], optics: Optics) -> Float[Array, "4"]:
+    c = optics.camera
+    return np.array([1 / c.fx, 1 / c.fy, (corner[0] - c.cx) / c.fx, (corner[1] - c.cy) / c.fy])
+
+
+def _cleaned(crop: Crop, config: ViewConfig) -> Float32[Array, "h w"]:
+    """Depth inside the mask, without what lies far from the object's bulk."""
+    inside = crop.mask & (crop.depth_m > 0)
+    if not inside.any():
+        return np.zeros_like(crop.depth_m)
+    return np.where(inside & _near_bulk(crop.depth_m, inside), crop.depth_m, np.float32(0))
+
+
+def _near_bulk(depth_m: Float32[Array, "h w"], inside: Bool[Array, "h w"]) -> Bool[Array, "h w"]:
+    """Depth within the object's possible reach: no farther from its median than 1.5 times its 10-90 % spread + 5 cm."""
+    low, middle, high = np.quantile(depth_m[inside], [0.1, 0.5, 0.9])
+    reach = 0.05 + 1.5 * (high - low)
+    return np.asarray(np.abs(depth_m - middle) < reach)
+
+
+def _moved_depth(crop: Crop, optics: Optics, motion: Float[Array, "4 4"], config: ViewConfig) -> Float32[Array, "h w"]:
+    """Depth as it would have been at colour's exposure: the object's points moved, then seen again (nearest wins)."""
+    dx, dy, x0, y0 = _ray_steps(crop.corner, optics)
+    depth_m = crop.depth_m.copy()
+    h, w = depth_m.shape
+    center = crop.depth_m[crop.mask & (crop.depth_m > 0)]
+    if len(center) == 0:
+        return np.zeros_like(depth_m)
+    z = float(np.median(center))
+    shift_px = motion[:2, :3] @ [0, 0, z] + motion[:2, 3]
+    reach = int(np.ceil(np.abs(shift_px).max() / z * optics.camera.fx)) + 2
+    grown = cv2.dilate(crop.mask.astype(np.uint8), np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)) > 0
+    use = grown & (depth_m > 0) & _near_bulk(depth_m, crop.mask & (depth_m > 0))
+    if crop.height_m is not None:
+        use &= crop.mask | (crop.height_m > 0.5 * config.above_table_m)
+    v, u = np.nonzero(use)
+    points = np.stack([(x0 + dx * u), (y0 + dy * v), np.ones(len(u))], -1) * depth_m[v, u][:, None]
+    moved = points @ motion[:3, :3].T + motion[:3, 3]
+    uu = np.round((moved[:, 0] / moved[:, 2] - x0) / dx).astype(int)
+    vv = np.round((moved[:, 1] / moved[:, 2] - y0) / dy).astype(int)
+    ok = (uu >= 0) & (vv >= 0) & (uu < w) & (vv < h)
+    out = np.full((h, w), np.inf, dtype=np.float32)
+    np.minimum.at(out, (vv[ok], uu[ok]), moved[ok, 2].astype(np.float32))
+    return np.where(np.isfinite(out) & crop.mask, out, np.float32(0))
+
+
+def _levels(
+    gray: Float32[Array, "h w"], mask: Bool[Array, "h w"], config: ViewConfig
+) -> tuple[Float32[Array, "h w"], Float32[Array, "h w"]]:
+    """Sharp and smooth grey, both levelled: divided by the brightness around (within the mask)."""
+    weight = mask.astype(np.float32)
+    around = _masked_blur(gray, weight, config.shade_px)
+    level = gray / (around + 0.03) - 1.0
+    smooth = _masked_blur(level, weight, config.smooth_px)
+    sharp = np.where(mask, level, smooth)
+    return sharp.astype(np.float32), smooth
+
+
+def _masked_blur(image: Float32[Array, "h w"], weight: Float32[Array, "h w"], sigma_px: float) -> Float32[Array, "h w"]:
+    above = cv2.GaussianBlur(image * weight, (0, 0), sigma_px)
+    return above / np.maximum(cv2.GaussianBlur(weight, (0, 0), sigma_px), 1e-3)
+
+
+def _samples(
+    pixels: Float32[Array, "h w 7"], rays: Float[Array, "4"], config: ViewConfig, seed: int
+) -> Float32[Array, "n 8"]:
+    v, u = np.nonzero(pixels[..., k.Z] > 0)
+    order = np.random.default_rng(seed).permutation(len(u))[: config.samples]
+    u, v = u[order], v[order]
+    seen = pixels[v, u]
+    directions = np.stack([rays[2] + rays[0] * u, rays[3] + rays[1] * v, np.ones(len(u))], -1)
+    points = directions * seen[:, k.Z, None]
+    return np.concatenate([points, seen[:, k.NX : k.NZ + 1], seen[:, k.SHARP : k.SMOOTH + 1]], -1).astype(np.float32)
+
+
+class ViewStore:
+    """The views of one or several tosses in the flat arrays that the kernels read."""
+
+    def __init__(self, optics: Optics, crops: list[Crop | None], config: ViewConfig) -> None:
+        sizes = [0 if c is None else int(c.mask.size) for c in crops]
+        self.optics, self.crops, self.config = optics, crops, config
+        self.maps = np.zeros((sum(sizes), k.CHANNELS), dtype=np.float32)
+        self.samples = np.zeros((config.samples * len(crops), 8), dtype=np.float32)
+        self.table: Int64[Array, "n 7"] = np.zeros((len(crops), 7), dtype=np.int64)
+        self.center_m = np.full((len(crops), 3), np.nan)
+        self.motion: list[Float[Array, "4 4"] | None] = [None] * len(crops)
+        for i, offset in enumerate(np.cumsum([0, *sizes[:-1]]) if sizes else []):
+            self.table[i, k.OFFSET], self.table[i, k.FIRST] = offset, i * config.samples
+
+    def __len__(self) -> int:
+        return len(self.crops)
+
+    def usable(self, i: int) -> bool:
+        return bool(self.table[i, k.COUNT] > 0)
+
+    def fill(self, i: int, motion: Float[Array, "4 4"] | None = None) -> bool:
+        """Make view i (again), with the object's motion from depth's to colour's exposure. False: nothing to see."""
+        crop = self.crops[i]
+        view = None if crop is None else make_view(crop, self.optics, self.config, motion)
+        self.table[i, k.COUNT] = 0
+        if view is None or crop is None:
+            return False
+        h, w = crop.mask.shape
+        offset, first, n = int(self.table[i, k.OFFSET]), int(self.table[i, k.FIRST]), len(view.samples)
+        self.maps[offset : offset + h * w] = view.pixels.reshape(-1, k.CHANNELS)
+        self.samples[first : first + n] = view.samples
+        self.table[i, [k.U0, k.V0, k.WIDTH, k.HEIGHT, k.COUNT]] = [*view.corner, w, h, n]
+        self.center_m[i] = view.center_m
+        self.motion[i] = motion
+        return True
+
+    @staticmethod
+    def joined(stores: list[ViewStore]) -> ViewStore:
+        """All views of several stores in one, in order; they must have one camera."""
+        out = ViewStore.__new__(ViewStore)
+        out.optics, out.config = stores[0].optics, stores[0].config
+        out.crops = [c for s in stores for c in s.crops]
+        out.motion = [m for s in stores for m in s.motion]
+        out.maps = np.concatenate([s.maps for s in stores])
+        out.samples = np.concatenate([s.samples for s in stores])
+        out.center_m = np.concatenate([s.center_m for s in stores])
+        tables, pixels, samples = [], 0, 0
+        for s in stores:
+            table = s.table.copy()
+            table[:, k.OFFSET] += pixels
+            table[:, k.FIRST] += samples
+            pixels, samples = pixels + len(s.maps), samples + len(s.samples)
+            tables.append(table)
+        out.table = np.concatenate(tables)
+        return out
+
+
+def exposure_gains(
+    frames: list[UInt8[Array, "h w 3"]], masks: list[Bool[Array, "h w"]], step: int = 8
+) -> Float[Array, " n"]:
+    """Brightness of each frame against the first, from pixels that belong to the object in neither (median of ratios).
+
+    1 where the background tells nothing. The response is not linear: a ratio of stored values serves small gains well.
+    """
+    kernel = np.ones((3, 3), np.uint8)
+    small = [cv2.resize(f, None, fx=1 / step, fy=1 / step, interpolation=cv2.INTER_AREA).astype(np.float32).mean(-1)
+             for f in frames]  # fmt: skip
+    free = [
+        cv2.dilate(cv2.resize(m.astype(np.uint8), s.shape[::-1], interpolation=cv2.INTER_AREA), kernel, iterations=2)
+        == 0
+        for m, s in zip(masks, small)
+    ]
+    gains = np.ones(len(frames))
+    for i in range(1, len(frames)):
+        use = free[0] & free[i] & (small[0] > 15) & (small[0] < 235) & (small[i] > 10) & (small[i] < 240)
+        if use.sum() > 50:
+            gains[i] = float(np.median(small[i][use] / small[0][use]))
+    return gains
