@@ -12,8 +12,8 @@ import sys
 from pathlib import Path
 
 from acquisition.synthetic.folder import write_session
+from acquisition.synthetic.lab import Lab
 from acquisition.synthetic.presets import described, preset
-from acquisition.synthetic.scene import Lab
 from recordings.errors import TosslabError
 from recordings.progress import Console
 

@@ -1,1 +1,1 @@
-"""The simulated lab: one scene generator for the synthetic driver, the samples and the variety that vision is tuned on."""
+"""The simulated lab: one scene generator for the synthetic driver, the samples and the variety to tune vision on."""

@@ -132,6 +132,8 @@ class MonoConfig:
     subframes: int = 4
     tosses: tuple[int, ...] | None = None
     """Which tosses get mono images; None: all."""
+    board_views: int = 0
+    """Views of the calibration board, at rest, by all cameras."""
 
 
 @dataclass(frozen=True)
@@ -158,7 +160,7 @@ class LightConfig:
     key_position_m: tuple[float, float, float] = (-0.7, -0.5, 1.7)
     key_radius_m: float = 0.08
     fill_position_m: tuple[float, float, float] = (0.9, 0.3, 1.9)
-    fill_radius_m: float = 0.45
+    fill_radius_m: float = 0.3
     key_rgb: tuple[float, float, float] = (1.0, 0.97, 0.92)
 
 

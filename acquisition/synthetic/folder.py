@@ -9,14 +9,17 @@ from typing import Any
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, UInt8, UInt16
+from jaxtyping import Bool, Float, UInt8, UInt16
 from numpy import ndarray as Array
 
 from acquisition.synthetic import physics
+from acquisition.synthetic.board import board_pose, board_tags
+from acquisition.synthetic.chance import BOARD, generator
+from acquisition.synthetic.lab import Lab
 from acquisition.synthetic.paint import PaintedMesh
-from acquisition.synthetic.scene import Lab, SyntheticToss, simulate
+from acquisition.synthetic.scene import SyntheticToss, simulate
 from recordings.errors import BadInput, WriteFailed
-from recordings.geometry import CameraModel
+from recordings.geometry import CameraModel, Transform
 from recordings.progress import Progress, Silent
 
 TRUTH_DEPTH_UNIT_M = 0.0001
@@ -36,7 +39,8 @@ def write_session(lab: Lab, tosses: Sequence[int], out: Path, progress: Progress
     for folder in (out, truth):
         folder.mkdir(parents=True)
     _write_json(out / "session.json", session_document(lab))
-    write_truth_of_lab(lab, truth)
+    boards = write_mono_cameras(lab, out) if lab.config.mono else []
+    write_truth_of_lab(lab, truth, boards)
     for done, number in enumerate(tosses):
         write_toss(lab, simulate(lab.config, number, lab), out, truth)
         progress.step(done + 1, len(tosses), f"toss {number}")
@@ -62,8 +66,8 @@ def session_document(lab: Lab) -> dict[str, Any]:
         "camera_frame": "OpenCV (x right, y down, z forward)",
         "table_tags": {
             "family": TAG_FAMILY,
-            "note": "printed on the table; tag frame as pupil-apriltags reports it (x right, y down, z into the paper); "
-            "size_m is the side of the black square",
+            "note": "printed on the table; tag frame as pupil-apriltags reports it (x right, y down, z into the "
+            "paper); size_m is the side of the black square",
             "tags": [
                 {"id": t.tag_id, "size_m": t.size_m, "T_world_tag": t.world_from_tag.matrix.tolist()}
                 for t in lab.table_tags
@@ -71,10 +75,45 @@ def session_document(lab: Lab) -> dict[str, Any]:
         },
         "notes": f"simulated, seed {lab.config.seed}",
     }
+    if lab.believed_world_from_base is not None:
+        document["arm"] = "franka_panda"
+        document["T_world_base"] = lab.believed_world_from_base.matrix.tolist()
     return document
 
 
-def write_truth_of_lab(lab: Lab, truth: Path) -> None:
+def write_mono_cameras(lab: Lab, out: Path) -> list[Transform]:
+    """mono/cameras.json (intrinsics only) and calibration/view_XX; returns the board's true poses in the world."""
+    (out / "mono").mkdir()
+    document: dict[str, Any] = {
+        "cameras": [{"name": v.camera.frame, **_intrinsics(v.camera)} for v in lab.mono_views],
+        "pixel_convention": PIXEL_CONVENTION,
+        "response": f"linear mono8, {1000 * lab.mono_config.exposure_s:g} ms exposure, cameras triggered together; "
+        "same clock as the colour timestamps of the toss",
+    }
+    if lab.mono_config.board_views:
+        tags = [
+            {"id": t.tag_id, "size_m": t.size_m, "T_board_tag": t.world_from_tag.matrix.tolist()} for t in board_tags()
+        ]
+        document["calibration_board"] = {
+            "family": TAG_FAMILY,
+            "frame": "board centre, z out of the printed side; tag frame as pupil-apriltags reports it",
+            "tags": tags,
+        }
+    _write_json(out / "mono" / "cameras.json", document)
+    rng = generator(lab.config.seed, BOARD)
+    poses = [board_pose(rng) for _ in range(lab.mono_config.board_views)]
+    for number, pose in enumerate(poses):
+        view = out / "calibration" / f"view_{number:02d}"
+        view.mkdir(parents=True)
+        color, depth, monos = lab.board_view(number, pose)
+        _write_png(view / "rgb.png", color[..., ::-1])
+        _write_png(view / "depth.png", depth)
+        for camera, image in zip(lab.mono_views, monos):
+            _write_png(view / f"{camera.camera.frame}.png", image)
+    return poses
+
+
+def write_truth_of_lab(lab: Lab, truth: Path, boards: Sequence[Transform]) -> None:
     """mesh.obj with its texture, physics.json, object_tags.json, calibration.json, sensor_truth.json."""
     _write_mesh(lab.object.mesh, truth)
     config = lab.config
@@ -99,7 +138,17 @@ def write_truth_of_lab(lab: Lab, truth: Path) -> None:
         ]
         convention = "T_object_tag: frame as pupil-apriltags reports it (x right, y down, z into the face)"
         _write_json(truth / "object_tags.json", {"family": TAG_FAMILY, "convention": convention, "tags": tags})
-    _write_json(truth / "calibration.json", {"T_world_d455": lab.world_from_d455.matrix.tolist()})
+    d455_from_world = lab.world_from_d455.inverse()
+    monos = {v.camera.frame: v.world_from_camera for v in lab.mono_views}
+    calibration: dict[str, Any] = {
+        "T_world_mono": {name: pose.matrix.tolist() for name, pose in monos.items()},
+        "T_d455_mono": {name: (d455_from_world @ pose).matrix.tolist() for name, pose in monos.items()},
+        "T_world_d455": lab.world_from_d455.matrix.tolist(),
+        "T_world_board": [pose.matrix.tolist() for pose in boards],
+    }
+    if lab.arm is not None:
+        calibration["T_world_base"] = lab.arm.world_from_base.matrix.tolist()
+    _write_json(truth / "calibration.json", calibration)
     _write_json(
         truth / "sensor_truth.json",
         {
@@ -107,6 +156,7 @@ def write_truth_of_lab(lab: Lab, truth: Path) -> None:
             "depth_delay_s": config.depth.delay_s,
             "exposure_s": config.color.exposure_s,
             "T_world_camera": lab.world_from_d455.matrix.tolist(),
+            "arm_clock_offset_s": config.arm.clock_offset_s if config.arm else 0.0,
         },
     )
 
@@ -123,6 +173,9 @@ def write_toss(lab: Lab, toss: SyntheticToss, out: Path, truth: Path) -> None:
         _write_png(there / "masks" / f"{k:06d}.png", _mask_picture(frame.mask))
         exact = np.round(frame.depth_exact_object_m / TRUTH_DEPTH_UNIT_M).astype(np.uint16)
         _write_png(there / "depth_exact_object" / f"{k:06d}.png", exact)
+        if frame.robot_mask is not None:
+            (there / "robot_masks").mkdir(exist_ok=True)
+            _write_png(there / "robot_masks" / f"{k:06d}.png", _mask_picture(frame.robot_mask))
     _write_png(here / "mask_first.png", _mask_picture(toss.frames[0].mask))
     _write_times(here / "timestamps.txt", [f.time_s for f in toss.frames])
     if lab.config.depth.delay_s != 0:
@@ -131,39 +184,72 @@ def write_toss(lab: Lab, toss: SyntheticToss, out: Path, truth: Path) -> None:
     if lab.config.say_release:
         document["release_time_s"] = toss.motion.instants.release_s
     _write_json(here / "toss.json", document)
+    if toss.arm_states is not None:
+        _write_arm(here / "arm.csv", toss.arm_states)
+    if toss.mono:
+        _write_mono(lab, toss, out / "mono" / name, there)
     _write_truth_poses(lab, toss, there)
+
+
+def _write_arm(path: Path, states: Float[Array, "n 16"]) -> None:
+    names = ["time_s", *(f"q{k}" for k in range(1, 8)), *(f"dq{k}" for k in range(1, 8)), "finger_width_m"]
+    formats = ["%.6f", *["%.6f"] * 7, *["%.5f"] * 7, "%.5f"]
+    np.savetxt(path, states, fmt=formats, delimiter=",", header=",".join(names), comments="")
+
+
+def _write_mono(lab: Lab, toss: SyntheticToss, folder: Path, there: Path) -> None:
+    for camera in lab.mono_views:
+        (folder / camera.camera.frame).mkdir(parents=True)
+    for k, shot in enumerate(toss.mono):
+        for camera, image in zip(lab.mono_views, shot.images):
+            _write_jpeg(folder / camera.camera.frame / f"{k:06d}.jpg", image, lab.mono_config.jpeg_quality)
+    _write_times(folder / "timestamps.txt", [shot.time_s for shot in toss.mono])
+    np.savez_compressed(
+        there / "poses_at_mono_times.npz",
+        t=np.array([shot.time_s for shot in toss.mono]),
+        T_world_object=np.array([shot.world_from_object.matrix for shot in toss.mono]),
+    )
 
 
 def _write_truth_poses(lab: Lab, toss: SyntheticToss, there: Path) -> None:
     instants, motion = toss.motion.instants, toss.motion.object
     times = np.array([f.time_s for f in toss.frames])
+    released = int(np.searchsorted(motion.times_s, toss.motion.free_s - 1e-9))
     world = np.array([f.world_from_object.matrix for f in toss.frames])
+    swing = toss.motion.swing
+    tool = {}
+    if lab.arm is not None and swing is not None:
+        tool["T_world_tcp"] = np.array([lab.arm.world_from_tool(swing.q_rad(t)).matrix for t in times])
     np.savez_compressed(
         there / "poses_camera_object.npz",
         t=times,
+        **tool,
         T_camera_object=lab.world_from_d455.inverse().matrix @ world,
         T_world_object=world,
         phase=np.array([instants.phase(t) for t in times]),
         nominal_frame=np.array([f.nominal for f in toss.frames]),
     )
-    np.savez_compressed(there / "states_148hz.npz", **_states(lab, toss))
+    np.savez_compressed(there / "states_148hz.npz", **_states(toss))
     _write_json(
         there / "toss_gt.json",
         {
             "source_toss": "simulated",
             "release_time_s": instants.release_s,
+            "fingers_open_s": toss.motion.free_s,
             "first_contact_time_s": instants.first_impact_s,
             "rest_time_s": instants.rest_s,
             "dropped_nominal_frames": list(toss.dropped),
             "exposure_gain": [f.brightness for f in toss.frames],
-            "simulated_until_s": float(motion.times_s[-1]),
+            "release_velocity_world_m_s": motion.velocity_world_m_s[released].tolist(),
+            "release_spin_object_rad_s": motion.angular_velocity_object_rad_s[released].tolist(),
         },
     )
 
 
-def _states(lab: Lab, toss: SyntheticToss) -> dict[str, Any]:
+def _states(toss: SyntheticToss) -> dict[str, Any]:
     instants, motion = toss.motion.instants, toss.motion.object
-    times = instants.release_s + np.arange(int((instants.rest_s - instants.release_s) * STATES_HZ) + 1) / STATES_HZ
+    start_s = toss.motion.free_s
+    times = start_s + np.arange(int((instants.rest_s - start_s) * STATES_HZ) + 1) / STATES_HZ
     rows = np.clip(np.searchsorted(motion.times_s, times - 1e-9), 0, len(motion.times_s) - 1)
     poses = [motion.at(t) for t in times]
     spin_object = motion.angular_velocity_object_rad_s[rows]
@@ -174,8 +260,8 @@ def _states(lab: Lab, toss: SyntheticToss) -> dict[str, Any]:
         "linear_velocity_world": motion.velocity_world_m_s[rows],
         "angular_velocity_body": spin_object,
         "angular_velocity_world": np.array([p.rotation @ w for p, w in zip(poses, spin_object)]),
-        "note": "SI, true world (z up, table z=0); quaternion world_from_body; position and velocity of the mesh origin; "
-        "t on the toss's clock, dt = 1/148 s",
+        "note": "SI, true world (z up, table z=0); quaternion world_from_body; position and velocity of the mesh "
+        "origin; t on the toss's clock, dt = 1/148 s, from the instant at which the object is free",
     }
 
 

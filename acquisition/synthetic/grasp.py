@@ -42,7 +42,9 @@ def grasp(config: ObjectConfig, solid: Solid) -> Grasp:
     closing = int(half.argmin())
     along = int(half.argmax()) if half.argmax() != closing else (closing + 1) % 3
     axes = np.eye(3)
-    return _grasp(-axes[along], axes[closing], (half[along] - PAD_OVERLAP_M) * axes[along], _fitting(2 * half[closing], config))
+    return _grasp(
+        -axes[along], axes[closing], (half[along] - PAD_OVERLAP_M) * axes[along], _fitting(2 * half[closing], config)
+    )
 
 
 def _fitting(width_m: float, config: ObjectConfig) -> float:

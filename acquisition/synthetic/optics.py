@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int8
@@ -15,6 +16,10 @@ from recordings.geometry import CameraModel, Transform
 
 BEHIND_SLACK_M = 0.003
 """A moving body hides the room unless it lies this much behind it (it may dip into the table at an impact)."""
+TABLE_REGION_M = 0.3
+"""Shadows of moving bodies fall on what is this near to the table's height."""
+TABLE_REACH_M = 1.2
+RAYS_AT_ONCE = 200_000
 GROUND_RGB = np.array([0.5, 0.38, 0.28], np.float32)
 SKY_RGB = np.array([0.95, 0.98, 1.05], np.float32)
 FAR = np.float32(np.inf)
@@ -97,6 +102,12 @@ class Light:
         self.key_rgb = np.float32(config.key) * np.array(config.key_rgb, np.float32)
         self.fill_rgb = np.float32(config.fill) * np.ones(3, np.float32)
 
+    @property
+    def discs(self) -> tuple[tuple[tuple[float, float, float], float], ...]:
+        """Centre and radius of the key and the fill light."""
+        config = self.config
+        return (config.key_position_m, config.key_radius_m), (config.fill_position_m, config.fill_radius_m)
+
     def lamps(self, rng: np.random.Generator, count: int) -> list[Lamps]:
         """Points spread evenly over the two discs (golden angle, turned at random)."""
         config, turn = self.config, rng.uniform(0, 2 * np.pi)
@@ -152,7 +163,7 @@ class StillPicture:
     facing: Float32[Array, "h w"]
     """Cosine between the ray and the surface's normal."""
 
-    @property
+    @cached_property
     def radiance(self) -> Float32[Array, "h w 3"]:
         return self.ambient + self.key + self.fill
 
@@ -160,35 +171,53 @@ class StillPicture:
 def still_picture(view: View, room: Standing, light: Light, rng: np.random.Generator, samples: int) -> StillPicture:
     """Render the room with `samples` jittered rays a pixel."""
     shape = view.rays.shape
-    whole = Box(0, 0, shape[1], shape[0])
-    sums = [np.zeros((shape[0] * shape[1], 3), np.float32) for _ in range(3)]
+    parts = np.zeros((3, *shape), np.float32)
     for (dx, dy), lamps in zip(jitters(samples), light.lamps(rng, samples)):
-        rays = view.jittered(whole, dx, dy)
-        owner, hits = room.cast(view.origin_m, rays)
-        for number in np.unique(owner[owner >= 0]):
-            one, rows = room.placed[number], np.flatnonzero(owner == number)
-            footprint = _footprint(one, view, hits["t_hit"][rows])
-            spot = surface(one, hits, rows, *_rays_of(view, rays, rows), footprint)
-            ambient, key, fill = light.parts(spot, view.origin_m, lamps)
-            key[room.occluded(spot.points_m, lamps.key_m, spot.normals)] = 0
-            fill[room.occluded(spot.points_m, lamps.fill_m, spot.normals)] = 0
-            for total, part in zip(sums, (ambient, key, fill)):
-                total[rows] += part
-    parts = [s.reshape(shape) / np.float32(samples) for s in sums]
+        for band in _bands(shape[1], shape[0]):
+            for total, part in zip(parts, _still_band(view, room, light, lamps, view.jittered(band, dx, dy))):
+                total[band.slices] += part.reshape(total[band.slices].shape) / np.float32(samples)
     return StillPicture(*parts, *_geometry(view, room))
 
 
-def _geometry(view: View, room: Standing) -> tuple[Array, Array, Array]:
-    shape = view.rays.shape
-    rays = view.rays.reshape(-1, 3)
+def _bands(width: int, height: int) -> Iterator[Box]:
+    """The image in strips, so that memory stays small."""
+    rows = max(1, RAYS_AT_ONCE // width)
+    for top in range(0, height, rows):
+        yield Box(0, top, width, min(height, top + rows))
+
+
+def _still_band(
+    view: View, room: Standing, light: Light, lamps: Lamps, rays: Float32[Array, "n 3"]
+) -> Float32[Array, "3 n 3"]:
+    """Radiance of the room along rays, from ambient, key and fill light."""
+    parts = np.zeros((3, len(rays), 3), np.float32)
     owner, hits = room.cast(view.origin_m, rays)
-    facing = np.zeros(len(rays), np.float32)
     for number in np.unique(owner[owner >= 0]):
-        rows = np.flatnonzero(owner == number)
-        facing[rows] = _facing(room.placed[number], hits, rows, rays[rows])
-    z = hits["t_hit"]
-    points = view.origin_m + rays * np.where(np.isfinite(z), z, 0)[:, None]
-    return points.reshape(shape), z.reshape(shape[:2]), facing.reshape(shape[:2])
+        one, rows = room.placed[number], np.flatnonzero(owner == number)
+        footprint = _footprint(one, view, hits["t_hit"][rows])
+        spot = surface(one, hits, rows, *_rays_of(view, rays, rows), footprint)
+        ambient, key, fill = light.parts(spot, view.origin_m, lamps)
+        key[room.occluded(spot.points_m, lamps.key_m, spot.normals)] = 0
+        fill[room.occluded(spot.points_m, lamps.fill_m, spot.normals)] = 0
+        parts[:, rows] = ambient, key, fill
+    return parts
+
+
+def _geometry(view: View, room: Standing) -> tuple[Array, Array, Array]:
+    """Points, depth and facing at the pixels' centres."""
+    shape = view.rays.shape
+    z, facing = np.zeros(shape[:2], np.float32), np.zeros(shape[:2], np.float32)
+    for band in _bands(shape[1], shape[0]):
+        rays = view.rays[band.slices].reshape(-1, 3)
+        owner, hits = room.cast(view.origin_m, rays)
+        cosine = np.zeros(len(rays), np.float32)
+        for number in np.unique(owner[owner >= 0]):
+            rows = np.flatnonzero(owner == number)
+            cosine[rows] = _facing(room.placed[number], hits, rows, rays[rows])
+        size = facing[band.slices].shape
+        z[band.slices], facing[band.slices] = hits["t_hit"].reshape(size), cosine.reshape(size)
+    points = view.origin_m + view.rays * np.where(np.isfinite(z), z, 0)[..., None]
+    return points, z, facing
 
 
 def _facing(one: Placed, hits: dict[str, Array], rows: Array, rays: Array) -> Float32[Array, " n"]:
@@ -248,12 +277,14 @@ def picture(
     view: View, still: StillPicture, light: Light, moving: Placement, times_s: Sequence[float], rng: np.random.Generator
 ) -> Float32[Array, "h w 3"]:
     """Linear radiance averaged over the instants of an exposure, with moving bodies, their blur and their shadows."""
-    out = still.radiance
+    out = still.radiance.copy()
     instants = [list(moving(t)) for t in times_s]
     box = Box(0, 0, 0, 0)
     for placed in instants:
         for one in placed:
-            box = box.join(_box_of(view, one)).join(_shadow_box(view, one, light))
+            box = box.join(_box_of(view, one))
+            for disc in light.discs:
+                box = box.join(_shadow_box(view, one, *disc))
     if box.empty:
         return out
     total = np.zeros((box.y1 - box.y0, box.x1 - box.x0, 3), np.float32)
@@ -272,7 +303,7 @@ def _instant(
     jitter: tuple[float, float],
     lamps: Lamps,
 ) -> Float32[Array, "h w 3"]:
-    seen = still.radiance[box.slices].reshape(-1, 3)
+    seen = still.radiance[box.slices].reshape(-1, 3).copy()
     _cast_shadows(seen, view, still, light, placed, box, lamps)
     rays = view.jittered(box, *jitter)
     z, owner, hits = nearest(placed, view, rays, [_rows(view, one, box) for one in placed])
@@ -292,16 +323,14 @@ def _instant(
 def _cast_shadows(
     seen: Array, view: View, still: StillPicture, light: Light, placed: list[Placed], box: Box, lamps: Lamps
 ) -> None:
-    shadow = Box(0, 0, 0, 0)
-    for one in placed:
-        shadow = shadow.join(_shadow_box(view, one, light))
-    rows = _rows_in(shadow.cut(box), box)
-    if len(rows) == 0:
-        return
+    """Take each lamp's light away from the room's pixels that a moving body hides it from."""
     points = still.points_m[box.slices].reshape(-1, 3)
-    rows = rows[np.abs(points[rows, 2]) < 0.3]
-    for part, lamp in ((still.key, lamps.key_m), (still.fill, lamps.fill_m)):
-        dark = rows[occluded(placed, points[rows], lamp, None)]
+    for part, lamp_m, disc in zip((still.key, still.fill), (lamps.key_m, lamps.fill_m), light.discs):
+        dark = np.zeros(len(points), dtype=bool)
+        for one in placed:
+            rows = _rows_in(_shadow_box(view, one, *disc).cut(box), box)
+            rows = rows[~dark[rows] & (np.abs(points[rows, 2]) < TABLE_REGION_M)]
+            dark[rows] = occluded([one], points[rows], lamp_m, None)
         seen[dark] -= part[box.slices].reshape(-1, 3)[dark]
 
 
@@ -321,22 +350,16 @@ def _box_of(view: View, one: Placed) -> Box:
     return view.around(one.world_from_body.points(one.body.corners_m))
 
 
-def _shadow_box(view: View, one: Placed, light: Light) -> Box:
-    """Where the body's shadows fall on the table: its box seen from points of both lamps, on the plane z = 0."""
+def _shadow_box(view: View, one: Placed, center_m: tuple[float, float, float], radius_m: float) -> Box:
+    """Where the body's shadow of one lamp falls on the table: its box seen from the lamp's rim, on the plane z = 0."""
     corners = one.world_from_body.points(one.body.corners_m)
-    config, found = light.config, Box(0, 0, 0, 0)
-    for center, radius in (
-        (config.key_position_m, config.key_radius_m),
-        (config.fill_position_m, config.fill_radius_m),
-    ):
-        spots = []
-        for dx, dy in ((-1, -1), (-1, 1), (1, -1), (1, 1)):
-            lamp = np.array(center) + radius * np.array([dx, dy, 0.0])
-            share = lamp[2] / np.maximum(lamp[2] - np.minimum(corners[:, 2], 0.9 * lamp[2]), 1e-3)
-            spots.append(lamp + share[:, None] * (corners - lamp))
-        on_table = np.clip(np.vstack([*spots, corners * [1, 1, 0]]), -1.2, 1.2)
-        found = found.join(view.around(on_table * [1, 1, 0]))
-    return found
+    spots = [corners * [1, 1, 0]]
+    for dx, dy in ((-1, -1), (-1, 1), (1, -1), (1, 1)):
+        lamp = np.array(center_m) + radius_m * np.array([dx, dy, 0.0])
+        share = lamp[2] / np.maximum(lamp[2] - np.minimum(corners[:, 2], 0.9 * lamp[2]), 1e-3)
+        spots.append(lamp + share[:, None] * (corners - lamp))
+    on_table = np.clip(np.vstack(spots), -TABLE_REACH_M, TABLE_REACH_M)
+    return view.around(on_table * [1, 1, 0])
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,10 +6,12 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 from acquisition.synthetic.config import (
+    ArmConfig,
     CameraConfig,
     ColorConfig,
     DepthConfig,
     ErrorConfig,
+    MonoConfig,
     MotionConfig,
     ObjectConfig,
     SceneConfig,
@@ -27,10 +29,18 @@ def _object(shape: Shape, surface: Surface, table: TableStyle = "wood", mass_kg:
 
 
 BOX = _object("box", "textured", "speckled")
+TOSSED_BY_ARM = replace(
+    _object("prism", "textured", mass_kg=0.12),
+    arm=ArmConfig(),
+    camera=CameraConfig(distance_m=0.85, distortion=(-0.055, 0.065, 0.0006, -0.0004, -0.02)),
+    motion=MotionConfig(release_height_m=0.3, forward_speed_m_s=0.7, upward_speed_m_s=0.45, spin_rad_s=4.0),
+)
+
+TAGGED = _object("cube", "tagged")
 
 PRESETS: dict[str, SceneConfig] = {
     # objects
-    "cube-tagged": _object("cube", "tagged"),
+    "cube-tagged": TAGGED,
     "cube-textured": _object("cube", "textured", "speckled"),
     "cube-few": _object("cube", "few", "plain"),
     "cube-plain": _object("cube", "plain"),
@@ -74,6 +84,17 @@ PRESETS: dict[str, SceneConfig] = {
     "depth-late-16ms": replace(BOX, depth=DepthConfig(delay_s=0.016)),
     # calibration
     "pose-error": replace(BOX, errors=ErrorConfig(camera_m=0.003, camera_deg=0.3, plane_m=0.003, plane_deg=0.3)),
+    # the arm in view
+    "arm-prism": TOSSED_BY_ARM,
+    "arm-box": replace(TOSSED_BY_ARM, object=ObjectConfig("box", surface="textured", mass_kg=0.2), table="speckled"),
+    "arm-l": replace(TOSSED_BY_ARM, object=ObjectConfig("l", surface="few", mass_kg=0.15)),
+    "arm-mug": replace(TOSSED_BY_ARM, object=ObjectConfig("mug", surface="textured", mass_kg=0.2), table="plain"),
+    "arm-slip-10mm": replace(TOSSED_BY_ARM, arm=ArmConfig(slip_m=0.01)),
+    "arm-off": replace(
+        TOSSED_BY_ARM, arm=ArmConfig(clock_offset_s=0.01), errors=ErrorConfig(base_m=0.005, base_deg=0.5)
+    ),
+    # ground truth cameras and board
+    "mono": replace(TAGGED, mono=MonoConfig(board_views=12)),
     "no-release-time": replace(BOX, say_release=False),
 }
 

@@ -113,7 +113,7 @@ class Surface:
 
 
 def cast(placed: Placed, origins_m: Float32[Array, "n 3"], directions: Float32[Array, "n 3"]) -> dict[str, Array]:
-    """Open3D's answer for world rays: `t_hit` (in lengths of `directions`; inf: missed), `primitive_ids`, `primitive_uvs`."""
+    """Open3D's answer for world rays: `t_hit` in lengths of `directions` (inf: missed), `primitive_ids` and `_uvs`."""
     import open3d as o3d
 
     body_from_world = placed.world_from_body.inverse()
@@ -184,9 +184,10 @@ def occluded(
     towards = light_m.astype(np.float32) - points_m
     starts = points_m if normals is None else points_m + normals * np.float32(NEAREST_M)
     dark = np.zeros(len(points_m), dtype=bool)
+    segments = _Segments(starts, towards)
     for one in placed:
         center = one.world_from_body.points(one.body.center_m).astype(np.float32)
-        rows = np.flatnonzero(~dark & _passes(starts, towards, center, one.body.radius_m))
+        rows = np.flatnonzero(~dark & segments.pass_near(center, one.body.radius_m))
         if len(rows) == 0:
             continue
         body_from_world = one.world_from_body.inverse()
@@ -199,11 +200,18 @@ def occluded(
     return dark
 
 
-def _passes(
-    starts: Float32[Array, "n 3"], towards: Float32[Array, "n 3"], center: Float32[Array, "3"], radius_m: float
-) -> Bool[Array, " n"]:
-    """Which segments come within a sphere."""
-    to_center = center - starts
-    share = np.einsum("ij,ij->i", to_center, towards) / np.einsum("ij,ij->i", towards, towards)
-    nearest = to_center - np.clip(share, 0, 1)[:, None] * towards
-    return np.einsum("ij,ij->i", nearest, nearest) < radius_m * radius_m
+class _Segments:
+    """Segments start .. start + towards, asked again and again whether they come near a sphere."""
+
+    def __init__(self, starts: Float32[Array, "n 3"], towards: Float32[Array, "n 3"]) -> None:
+        self._starts, self._towards = starts, towards
+        self._tt = np.einsum("ij,ij->i", towards, towards)
+        self._ts = np.einsum("ij,ij->i", towards, starts)
+        self._ss = np.einsum("ij,ij->i", starts, starts)
+
+    def pass_near(self, center: Float32[Array, "3"], radius_m: float) -> Bool[Array, " n"]:
+        """|c - s - x t|^2 < r^2 at the nearest point, x = clip(t.(c - s) / t.t, 0, 1)."""
+        along = self._towards @ center - self._ts
+        x = np.clip(along / self._tt, 0, 1)
+        from_start = center @ center - 2 * (self._starts @ center) + self._ss
+        return from_start - 2 * x * along + x * x * self._tt < radius_m * radius_m

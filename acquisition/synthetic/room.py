@@ -34,6 +34,7 @@ class Room:
 
 def build_room(config: SceneConfig, facing: Float[Array, "2"], rng: np.random.Generator) -> Room:
     """The room of a session; `facing` is the direction (x, y) in which the colour camera looks: posters hang there."""
+    facing = facing / np.linalg.norm(facing)
     meshes = [_table(config, rng), _flat(rng, "floor", (6.0, 6.0), _lying((0.0, 0.0, FLOOR_M)), 150.0)]
     meshes += _walls(facing, rng)
     meshes += _clutter(facing, rng)

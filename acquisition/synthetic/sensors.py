@@ -61,10 +61,14 @@ def color_image(signal: Float32[Array, "h w 3"]) -> UInt8[Array, "h w 3"]:
     return np.round(255 * to_srgb(signal)).astype(np.uint8)
 
 
-def mono_image(signal: Float32[Array, "h w 3"]) -> UInt8[Array, "h w"]:
+def grey(radiance: Float32[Array, "h w 3"]) -> Float32[Array, "h w"]:
+    """What a monochrome sensor makes of colours."""
+    return radiance @ np.array([0.3, 0.55, 0.15], np.float32)
+
+
+def mono_image(signal: Float32[Array, "h w"]) -> UInt8[Array, "h w"]:
     """Linear 8-bit grey (a machine-vision camera with gamma 1)."""
-    grey = signal @ np.array([0.3, 0.55, 0.15], np.float32)
-    return np.round(255 * np.clip(grey, 0, 1)).astype(np.uint8)
+    return np.round(255 * np.clip(signal, 0, 1)).astype(np.uint8)
 
 
 class DepthSensor:

@@ -99,13 +99,17 @@ def marker(tag_id: int) -> Float32[Array, "n n"]:
     return np.where(turned > 127, WHITE, BLACK).astype(np.float32)
 
 
-def paint_tag(picture: Float32[Array, "h w 3"], tag_id: int, center_px: Float[Array, "2"], side_px: float) -> None:
-    """Draw a tag and its white border (one module) into a picture, exact to a fraction of a pixel.
+def paint_tag(
+    picture: Float32[Array, "h w 3"], tag_id: int, center_px: Float[Array, "2"], side_px: float, turned: bool = False
+) -> None:
+    """Draw a tag and its white border (one module) into a picture, exact to a fraction of a pixel. The tag's x and y
+    run along the picture's, or against them where it is `turned`.
 
     `center_px` and `side_px` (of the black square) are continuous: pixel i covers i..i+1.
     """
     module = MARKER_PX // MARKER_MODULES
-    card = np.pad(marker(tag_id), module, constant_values=WHITE)
+    upright = marker(tag_id)
+    card = np.pad(upright[::-1, ::-1] if turned else upright, module, constant_values=WHITE)
     scale = side_px / MARKER_PX
     # centre of card pixel i lies at i + 0.5 of the card; the same holds in the picture
     shift = center_px - scale * (len(card) / 2.0) + 0.5 * scale - 0.5
