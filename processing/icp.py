@@ -1,0 +1,189 @@
+"""Aligning the reprojected shape to the raw depth, frame by frame (the paper's step 5).
+
+The shape moves, the measurement stays: every raw depth pixel on the object is matched to the nearest point of the
+shape, and the pose correction minimises the point-to-plane distances with Tukey's weights (Chen and Medioni 1991).
+Directions that the visible faces do not constrain stay where they were (Zhang, Kaess and Singh 2016). All in metres.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32
+from numpy import ndarray as Array
+
+from recordings.geometry import CameraModel, rotation_exp
+from recordings.tracks import ObjectShape
+
+Verdict = Literal["aligned", "too few points", "poor fit", "moved too far", "lost"]
+
+
+@dataclass(frozen=True)
+class IcpConfig:
+    iterations: int = 12
+    """Gauss-Newton steps, each with new matches."""
+    most_points: int = 3000
+    """Raw depth points used of a frame, drawn evenly."""
+    fewest_points: int = 150
+    """Below this a frame is rejected: too few points."""
+    reach_m: float = 0.015
+    """Matches further apart than this are outliers; shrinks to a third over the iterations."""
+    least_fitness: float = 0.6
+    """Share of the points that must end within a third of `reach_m`, else: poor fit."""
+    most_rotation_rad: float = 0.2
+    """A larger correction is rejected: moved too far."""
+    most_translation_m: float = 0.02
+    observable: float = 0.02
+    """A direction whose eigenvalue is below this share of the best-constrained one's is not observable."""
+
+
+@dataclass(frozen=True, eq=False)
+class Alignment:
+    """One frame's result. `camera_from_object` equals the start unless the verdict is `aligned`.
+
+    `fitness`: share of points matched; `rmse_m` of those; `held` counts the directions (of six) not observable.
+    """
+
+    camera_from_object: Float[Array, "4 4"]
+    verdict: Verdict
+    fitness: float
+    rmse_m: float
+    held: int
+
+
+class ShapeSurface:
+    """Nearest points of a shape and the outward normals there."""
+
+    def __init__(self, shape: ObjectShape) -> None:
+        import open3d as o3d
+
+        self._core: Any = o3d.core
+        self._scene: Any = o3d.t.geometry.RaycastingScene()
+        self._scene.add_triangles(
+            o3d.core.Tensor(shape.vertices_m.astype(np.float32)), o3d.core.Tensor(shape.faces.astype(np.uint32))
+        )
+        self.radius_m = float(np.linalg.norm(shape.vertices_m - shape.vertices_m.mean(0), axis=1).mean())
+        self.centre_m = shape.vertices_m.mean(0)
+
+    def nearest(self, points_m: Float[Array, "n 3"]) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"]]:
+        found = self._scene.compute_closest_points(self._core.Tensor(points_m.astype(np.float32)))
+        return found["points"].numpy().astype(np.float64), found["primitive_normals"].numpy().astype(np.float64)
+
+
+def align_frame(
+    surface: ShapeSurface,
+    points_camera_m: Float[Array, "n 3"],
+    camera_from_object: Float[Array, "4 4"],
+    config: IcpConfig,
+) -> Alignment:
+    """Move the pose so that the shape lies on the raw points of one frame (n, 3) in the camera frame."""
+    if not np.isfinite(camera_from_object).all():
+        return Alignment(camera_from_object, "lost", 0.0, float("nan"), 6)
+    if len(points_camera_m) < config.fewest_points:
+        return Alignment(camera_from_object, "too few points", 0.0, float("nan"), 6)
+    pose, held = camera_from_object.copy(), 6
+    for step in range(config.iterations):
+        reach_m = config.reach_m * max(1 / 3, 1 - step / max(config.iterations - 1, 1))
+        in_object, gap, normal, facing = _matches(surface, points_camera_m, pose)
+        use = facing & (np.abs(gap) < reach_m)
+        move, held = _solve(in_object - surface.centre_m, gap, normal, use, surface.radius_m, reach_m, config)
+        pose = pose @ _about(surface.centre_m, move)
+        if np.linalg.norm(move[:3]) < 1e-5 and np.linalg.norm(move[3:]) < 1e-6:
+            break
+    _, gap, _, facing = _matches(surface, points_camera_m, pose)
+    near = facing & (np.abs(gap) < config.reach_m / 3)
+    fitness = float(near.mean())
+    rmse_m = float(np.sqrt((gap[near] ** 2).mean())) if near.any() else float("nan")
+    verdict = _judge(camera_from_object, pose, surface.centre_m, fitness, config)
+    return Alignment(pose if verdict == "aligned" else camera_from_object, verdict, fitness, rmse_m, held)
+
+
+def align_frames(
+    shape: ObjectShape,
+    depths_m: Sequence[Float32[Array, "h w"]],
+    masks: Sequence[Bool[Array, "h w"]],
+    camera: CameraModel,
+    camera_from_object: Float[Array, "n 4 4"],
+    config: IcpConfig,
+) -> list[Alignment]:
+    """`align_frame` on every frame of a toss; raw depth inside the raw mask is what the shape is laid on."""
+    surface = ShapeSurface(shape)
+    rays = camera.pixel_rays()
+    out = []
+    for depth_m, mask, pose in zip(depths_m, masks, camera_from_object, strict=True):
+        v, u = np.nonzero(mask & (depth_m > 0))
+        every = max(1, len(v) // config.most_points)
+        v, u = v[::every], u[::every]
+        points = rays[v, u] * depth_m[v, u, None].astype(np.float64)
+        out.append(align_frame(surface, points, pose, config))
+    return out
+
+
+def count_verdicts(alignments: Sequence[Alignment]) -> dict[str, int]:
+    """How many frames ended with which verdict, for the stage's counts."""
+    found: dict[str, int] = {}
+    for a in alignments:
+        found[a.verdict] = found.get(a.verdict, 0) + 1
+    return found
+
+
+def _matches(
+    surface: ShapeSurface, points_camera_m: Float[Array, "n 3"], pose: Float[Array, "4 4"]
+) -> tuple[Float[Array, "n 3"], Float[Array, " n"], Float[Array, "n 3"], Bool[Array, " n"]]:
+    """Points in the object frame, their signed distance to the matched plane, its normal, and whether that plane
+    faces the camera (a point of the far side's noise must not pull on it)."""
+    in_object = (points_camera_m - pose[:3, 3]) @ pose[:3, :3]
+    nearest, normal = surface.nearest(in_object)
+    gap = ((in_object - nearest) * normal).sum(-1)
+    towards_camera = -pose[:3, :3].T @ pose[:3, 3] - in_object
+    return in_object, gap, normal, (normal * towards_camera).sum(-1) > 0
+
+
+def _solve(
+    arm: Float[Array, "n 3"],
+    gap: Float[Array, " n"],
+    normal: Float[Array, "n 3"],
+    use: Bool[Array, " n"],
+    radius_m: float,
+    reach_m: float,
+    config: IcpConfig,
+) -> tuple[Float[Array, "6"], int]:
+    """Correction (rotation vector, shift) of object coordinates about the centre, and how many directions were held.
+
+    Rotation is scaled by the object's radius, so that eigenvalues of turning and shifting can be compared.
+    """
+    if use.sum() < 6:
+        return np.zeros(6), 6
+    weight = np.where(use, (1 - (gap / reach_m) ** 2) ** 2, 0.0)
+    jacobian = np.concatenate([np.cross(arm, normal) / radius_m, normal], -1)
+    information = (weight[:, None] * jacobian).T @ jacobian
+    right = (weight * gap) @ jacobian
+    values, vectors = np.linalg.eigh(information)
+    seen = values > config.observable * values[-1]
+    scaled = vectors[:, seen] @ ((vectors[:, seen].T @ right) / values[seen])
+    # the points move by -correction in object coordinates when the pose moves by +correction
+    return np.concatenate([scaled[:3] / radius_m, scaled[3:]]), int((~seen).sum())
+
+
+def _about(centre_m: Float[Array, "3"], move: Float[Array, "6"]) -> Float[Array, "4 4"]:
+    """Rigid motion by a rotation vector about a centre and a shift."""
+    out = np.eye(4)
+    out[:3, :3] = rotation_exp(move[:3])
+    out[:3, 3] = centre_m - out[:3, :3] @ centre_m + move[3:]
+    return out
+
+
+def _judge(
+    start: Float[Array, "4 4"], end: Float[Array, "4 4"], centre_m: Float[Array, "3"], fitness: float, config: IcpConfig
+) -> Verdict:
+    if fitness < config.least_fitness:
+        return "poor fit"
+    cosine = (np.trace(start[:3, :3].T @ end[:3, :3]) - 1) / 2
+    turned_rad = float(np.arccos(np.clip(cosine, -1, 1)))
+    shift = (end[:3, :3] @ centre_m + end[:3, 3]) - (start[:3, :3] @ centre_m + start[:3, 3])
+    if turned_rad > config.most_rotation_rad or np.linalg.norm(shift) > config.most_translation_m:
+        return "moved too far"
+    return "aligned"

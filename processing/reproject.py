@@ -1,0 +1,207 @@
+"""Reprojection: the refined shape at the estimated poses, drawn into depth images D' and masks M' (the paper's step 4).
+
+The default renderer casts one ray per pixel (Open3D, exact, lens distortion included); Drake's, which the paper used,
+stands behind the same protocol and needs the extra `sim`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, Literal, Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32
+from numpy import ndarray as Array
+
+from recordings.errors import BadInput
+from recordings.geometry import CameraModel
+from recordings.records import RgbdFrame
+from recordings.tracks import ObjectShape
+
+Occlusion = Literal["fill", "subtract"]
+RendererName = Literal["raycast", "drake"]
+
+
+@runtime_checkable
+class Renderer(Protocol):
+    """Draws one shape into depth images of one camera."""
+
+    name: str
+
+    def depth(self, camera_from_object: Float[Array, "4 4"]) -> Float32[Array, "h w"]:
+        """Depth along the optical axis in metres of the shape at a pose; 0 where no ray meets it."""
+        ...
+
+
+class RaycastRenderer:
+    """One ray through the centre of every pixel, against the triangles themselves."""
+
+    name = "raycast"
+
+    def __init__(self, shape: ObjectShape, camera: CameraModel) -> None:
+        import open3d as o3d
+
+        self._core: Any = o3d.core
+        self._scene: Any = o3d.t.geometry.RaycastingScene()
+        self._scene.add_triangles(
+            o3d.core.Tensor(shape.vertices_m.astype(np.float32)), o3d.core.Tensor(shape.faces.astype(np.uint32))
+        )
+        self._vertices_m = shape.vertices_m
+        self._camera = camera
+        self._rays = camera.pixel_rays()
+
+    def depth(self, camera_from_object: Float[Array, "4 4"]) -> Float32[Array, "h w"]:
+        out = np.zeros((self._camera.height, self._camera.width), dtype=np.float32)
+        box = self._box(camera_from_object)
+        if box is None:
+            return out
+        object_from_camera = np.linalg.inv(camera_from_object)
+        along = self._rays[box] @ object_from_camera[:3, :3].T
+        origin = np.broadcast_to(object_from_camera[:3, 3], along.shape)
+        rays = np.concatenate([origin, along], -1).astype(np.float32)
+        hit = self._scene.cast_rays(self._core.Tensor(rays))["t_hit"].numpy()
+        out[box] = np.where(np.isfinite(hit), hit, 0)  # rays have z = 1, so t is depth along the axis
+        return out
+
+    def _box(self, camera_from_object: Float[Array, "4 4"]) -> tuple[slice, slice] | None:
+        """The part of the image that the shape can touch; all of it when a vertex is near or behind the camera."""
+        points = self._vertices_m @ camera_from_object[:3, :3].T + camera_from_object[:3, 3]
+        whole = (slice(0, self._camera.height), slice(0, self._camera.width))
+        if points[:, 2].max() <= 0:
+            return None
+        pixels = self._camera.project(points)
+        if not np.isfinite(pixels).all():
+            return whole
+        low = np.floor(pixels.min(0)).astype(int) - 2
+        high = np.ceil(pixels.max(0)).astype(int) + 3
+        rows = slice(max(low[1], 0), min(high[1], self._camera.height))
+        columns = slice(max(low[0], 0), min(high[0], self._camera.width))
+        return (rows, columns) if rows.start < rows.stop and columns.start < columns.stop else None
+
+
+class DrakeRenderer:
+    """Drake's VTK renderer, as the authors used it; a distorted lens is drawn ideal and looked up at its rays."""
+
+    name = "drake"
+    WIDER = 1.15
+    """How much wider than the distorted image the ideal one is drawn, in focal lengths."""
+
+    def __init__(self, shape: ObjectShape, camera: CameraModel) -> None:
+        import tempfile
+
+        try:
+            import pydrake.geometry  # noqa: F401
+        except ImportError as missing:
+            raise BadInput(
+                "the drake renderer needs Drake, which is not installed; run `pip install -e .[sim]`, "
+                "or leave out `--renderer drake`"
+            ) from missing
+        import trimesh
+
+        self._camera = camera
+        self._ideal = camera if camera.distortion_model == "none" else _ideal_camera(camera, self.WIDER)
+        self._folder = tempfile.TemporaryDirectory()
+        path = f"{self._folder.name}/shape.obj"
+        trimesh.Trimesh(shape.vertices_m, shape.faces, process=False).export(path, include_normals=True)
+        self._path = path
+
+    def depth(self, camera_from_object: Float[Array, "4 4"]) -> Float32[Array, "h w"]:
+        ideal = self._draw(camera_from_object)
+        if self._ideal is self._camera:
+            return ideal
+        pixels = self._ideal.project(self._camera.pixel_rays())
+        u, v = np.rint(pixels).astype(int).transpose(2, 0, 1)
+        inside = (u >= 0) & (u < self._ideal.width) & (v >= 0) & (v < self._ideal.height)
+        return np.where(inside, ideal[v.clip(0, self._ideal.height - 1), u.clip(0, self._ideal.width - 1)], 0)
+
+    def _draw(self, camera_from_object: Float[Array, "4 4"]) -> Float32[Array, "h w"]:
+        from pydrake.common.eigen_geometry import Isometry3
+        from pydrake.geometry import (
+            ClippingRange,
+            DepthRange,
+            DepthRenderCamera,
+            GeometryInstance,
+            MakeRenderEngineVtk,
+            Mesh,
+            PerceptionProperties,
+            RenderCameraCore,
+            RenderEngineVtkParams,
+            RenderLabel,
+            Rgba,
+            SceneGraph,
+        )
+        from pydrake.math import RigidTransform
+        from pydrake.systems.sensors import CameraInfo
+
+        c = self._ideal
+        scene = SceneGraph()
+        scene.AddRenderer("vtk", MakeRenderEngineVtk(RenderEngineVtkParams()))
+        source = scene.RegisterSource("tosslab")
+        pose = RigidTransform(Isometry3(camera_from_object))
+        instance = GeometryInstance(pose, Mesh(self._path, 1.0), "shape")
+        properties = PerceptionProperties()
+        properties.AddProperty("label", "id", RenderLabel(1))
+        properties.AddProperty("phong", "diffuse", Rgba(1, 1, 1, 1))
+        instance.set_perception_properties(properties)
+        scene.RegisterAnchoredGeometry(source, instance)
+        # Drake's image coordinates put the centre of the first pixel at (0.5, 0.5)
+        info = CameraInfo(c.width, c.height, c.fx, c.fy, c.cx + 0.5, c.cy + 0.5)
+        core = RenderCameraCore("vtk", info, ClippingRange(0.05, 5.0), RigidTransform())
+        context = scene.CreateDefaultContext()
+        query = scene.get_query_output_port().Eval(context)
+        image = query.RenderDepthImage(
+            DepthRenderCamera(core, DepthRange(0.06, 4.9)), scene.world_frame_id(), RigidTransform()
+        )
+        depth_m = np.array(image.data)[..., 0]
+        return np.where(np.isfinite(depth_m), depth_m, 0).astype(np.float32)
+
+
+def _ideal_camera(camera: CameraModel, wider: float) -> CameraModel:
+    """A pinhole camera with the same focal length that sees more than the distorted image does."""
+    width, height = int(camera.width * wider), int(camera.height * wider)
+    K = camera.K.copy()
+    K[0, 2] += (width - camera.width) / 2
+    K[1, 2] += (height - camera.height) / 2
+    return replace(camera, width=width, height=height, K=K, distortion_model="none", distortion=())
+
+
+def make_renderer(name: RendererName, shape: ObjectShape, camera: CameraModel) -> Renderer:
+    """A renderer by its name. Raises BadInput when the package it needs is missing."""
+    return RaycastRenderer(shape, camera) if name == "raycast" else DrakeRenderer(shape, camera)
+
+
+@dataclass(frozen=True, eq=False)
+class Reprojection:
+    """What one frame looks like with the learned shape in it.
+
+    `depth_m` (D') is 0 outside `mask` (M'). `colorless` marks pixels of the mask where something else (the robot)
+    stands in front: the shape is there, but the picture's colour is not the object's.
+    """
+
+    depth_m: Float32[Array, "h w"]
+    mask: Bool[Array, "h w"]
+    colorless: Bool[Array, "h w"]
+
+    def frame(self, raw: RgbdFrame) -> RgbdFrame:
+        """The raw frame with D' in place of its depth inside M'; its own depth stays outside."""
+        return replace(raw, depth_m=np.where(self.mask, self.depth_m, raw.depth_m).astype(np.float32))
+
+
+def reproject(
+    renderer: Renderer,
+    camera_from_object: Float[Array, "4 4"],
+    occluder: Bool[Array, "h w"] | None = None,
+    occlusion: Occlusion = "fill",
+) -> Reprojection:
+    """D' and M' of one frame.
+
+    `fill` (the paper's text) keeps the shape where the occluder hides it and marks it colourless; `subtract` (the
+    authors' code) cuts the occluder out of both.
+    """
+    depth_m = renderer.depth(camera_from_object)
+    mask = depth_m > 0
+    hidden = mask & occluder if occluder is not None else np.zeros_like(mask)
+    if occlusion == "subtract":
+        mask = mask & ~hidden
+        return Reprojection(np.where(mask, depth_m, 0).astype(np.float32), mask, np.zeros_like(mask))
+    return Reprojection(depth_m, mask, hidden)
