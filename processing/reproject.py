@@ -109,10 +109,8 @@ class DrakeRenderer:
         ideal = self._draw(camera_from_object)
         if self._ideal is self._camera:
             return ideal
-        pixels = self._ideal.project(self._camera.pixel_rays())
-        u, v = np.rint(pixels).astype(int).transpose(2, 0, 1)
-        inside = (u >= 0) & (u < self._ideal.width) & (v >= 0) & (v < self._ideal.height)
-        return np.where(inside, ideal[v.clip(0, self._ideal.height - 1), u.clip(0, self._ideal.width - 1)], 0)
+        pixels = self._ideal.project(self._camera.pixel_rays()).astype(np.float32)
+        return _look_up_depth(ideal, pixels)
 
     def _draw(self, camera_from_object: Float[Array, "4 4"]) -> Float32[Array, "h w"]:
         from pydrake.common.eigen_geometry import Isometry3
@@ -154,6 +152,19 @@ class DrakeRenderer:
         )
         depth_m = np.array(image.data)[..., 0]
         return np.where(np.isfinite(depth_m), depth_m, 0).astype(np.float32)
+
+
+def _look_up_depth(depth_m: Float32[Array, "h w"], pixels: Float32[Array, "hc wc 2"]) -> Float32[Array, "hc wc"]:
+    """Depth between pixels: inverse depth is linear over a plane; at the outline the nearest pixel decides."""
+    import cv2
+
+    drawn = (depth_m > 0).astype(np.float32)
+    inverse = np.divide(1, depth_m, out=np.zeros_like(depth_m), where=depth_m > 0)
+    u, v = pixels[..., 0], pixels[..., 1]
+    share, between = cv2.remap(drawn, u, v, cv2.INTER_LINEAR), cv2.remap(inverse, u, v, cv2.INTER_LINEAR)
+    nearest = cv2.remap(depth_m, u, v, cv2.INTER_NEAREST)
+    whole = share > 0.999
+    return np.where(whole, 1 / np.where(whole, between, 1), nearest).astype(np.float32)
 
 
 def _ideal_camera(camera: CameraModel, wider: float) -> CameraModel:
