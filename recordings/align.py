@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import lru_cache
+
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float, Float32
 from numpy import ndarray as Array
 
-from recordings.errors import FrameMismatch
+from recordings.errors import BadInput, FrameMismatch
 from recordings.geometry import CameraModel, Transform
 
-JUMP = 0.03
-"""Neighbouring depths that differ by more than this share belong to different surfaces: nothing is drawn between them."""
+STEP_RELATIVE = 0.008
+STEP_PER_M = 0.010
+"""Neighbouring depths that differ by less than 0.8 % + z * 1 % per metre are one surface: the second part is the noise
+of a stereo camera, which grows with the square of the distance."""
+STEP_MOST = 0.10
+"""Up to this share a step is still one surface if it continues its neighbours' (a plane seen at a grazing angle)."""
 
 
 def align_depth(
@@ -18,46 +25,58 @@ def align_depth(
 ) -> Float32[Array, "hc wc"]:
     """Depth along the colour camera's axis at the colour camera's pixels; 0 where no ray of the depth camera tells.
 
-    The depth image is drawn as a surface (samples between neighbours that lie on one surface, none across jumps) into
-    a z-buffer of the colour camera, so that a background that the colour camera cannot see never shows through.
+    The depth image is drawn as a surface (triangles between neighbours that lie on one surface, none across jumps)
+    into a z-buffer of the colour camera, so that a background that the colour camera cannot see never shows through.
     The two exposure times are not touched: a moving object is where it was when depth was exposed.
     """
+    from recordings import align_kernels
+
+    if depth_m.shape != (depth_camera.height, depth_camera.width):
+        found = f"{depth_m.shape[1]}x{depth_m.shape[0]}"
+        raise BadInput(f"a depth image of {found}, its camera says {depth_camera.width}x{depth_camera.height}")
+    plan = _plan(depth_camera, color_camera, color_from_depth)
+    depth = np.where(np.isfinite(depth_m), depth_m, np.float32(0))
+    pixels = np.empty((*depth.shape, 2))
+    z_m = np.zeros(depth.shape)
+    align_kernels.project(depth, plan.rays, color_from_depth.translation_m, plan.lens, pixels, z_m)
+    if color_camera.distortion_model == "fisheye":
+        points_m = plan.rays * depth[..., None] + color_from_depth.translation_m
+        pixels = np.where((z_m > 0)[..., None], color_camera.project(points_m), 0.0)
+    out = np.zeros((color_camera.height, color_camera.width), dtype=np.float32)
+    align_kernels.draw(depth, pixels, z_m, out, plan.limits)
+    return out
+
+
+@dataclass(frozen=True, eq=False)
+class _Plan:
+    """What does not change from frame to frame: the depth camera's rays in colour axes, the colour lens as numbers."""
+
+    rays: Float[Array, "h w 3"]
+    lens: Float[Array, "14"]
+    limits: Float[Array, "4"]
+
+
+@lru_cache(maxsize=8)
+def _plan(depth_camera: CameraModel, color_camera: CameraModel, color_from_depth: Transform) -> _Plan:
     if (color_from_depth.target, color_from_depth.source) != (color_camera.frame, depth_camera.frame):
         raise FrameMismatch(f"{color_from_depth} does not lead from {depth_camera.frame} to {color_camera.frame}")
-    rays = depth_camera.pixel_rays()
-    density = max(1, int(np.ceil(1.2 * color_camera.fx / depth_camera.fx)))
-    out = np.zeros(color_camera.height * color_camera.width, dtype=np.float32)
-    cells, depths = [], []
-    for points_m in _surface_samples(rays * depth_m[..., None].astype(np.float64), depth_m, density):
-        seen = color_from_depth.points(points_m)
-        pixels = color_camera.project(seen)
-        inside = color_camera.sees(pixels)
-        u, v = np.rint(pixels[inside]).astype(np.int64).T
-        cells.append(v.clip(0, color_camera.height - 1) * color_camera.width + u.clip(0, color_camera.width - 1))
-        depths.append(seen[inside, 2].astype(np.float32))
-    cell, depth = np.concatenate(cells), np.concatenate(depths)
-    far_first = np.argsort(-depth, kind="stable")
-    out[cell[far_first]] = depth[far_first]
-    return out.reshape(color_camera.height, color_camera.width)
+    radial = color_camera.distortion_model in ("brown-conrady", "rational")
+    coefficients = np.zeros(8)
+    coefficients[: len(color_camera.distortion) if radial else 0] = color_camera.distortion if radial else ()
+    K = color_camera.K
+    lens = np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2], K[0, 1], *coefficients, _widest_r2(color_camera)])
+    splat_px = 0.5 * max(0.0, color_camera.fx / depth_camera.fx - 1.0)
+    return _Plan(
+        np.ascontiguousarray(depth_camera.pixel_rays() @ color_from_depth.rotation.T),
+        lens,
+        np.array([STEP_RELATIVE, STEP_PER_M, STEP_MOST, splat_px]),
+    )
 
 
-def _surface_samples(points_m: Array, depth_m: Array, density: int) -> list[Array]:
-    """Points on the bilinear patches between neighbouring pixels, `density` per side; lone pixels as themselves."""
-    z = depth_m.astype(np.float64)
-    corners = [points_m[:-1, :-1], points_m[:-1, 1:], points_m[1:, :-1], points_m[1:, 1:]]
-    stack = np.stack([z[:-1, :-1], z[:-1, 1:], z[1:, :-1], z[1:, 1:]])
-    low, high = stack.min(0), stack.max(0)
-    whole = (low > 0) & (high - low < JUMP * high)
-    samples = [points_m[z > 0]]
-    if density == 1:
-        return samples
-    patch = [c[whole] for c in corners]
-    steps = np.arange(density) / density
-    for a in steps:
-        for b in steps:
-            if a == 0 and b == 0:
-                continue
-            top = patch[0] * (1 - b) + patch[1] * b
-            bottom = patch[2] * (1 - b) + patch[3] * b
-            samples.append(top * (1 - a) + bottom * a)
-    return samples
+def _widest_r2(camera: CameraModel) -> float:
+    """Squared length of the longest (x, y) that the image shows, and a little more: what lies beyond is not on it."""
+    u, v = np.arange(camera.width, dtype=np.float64), np.arange(camera.height, dtype=np.float64)
+    border = [np.stack([u, np.full_like(u, y)], -1) for y in (0.0, camera.height - 1.0)]
+    border += [np.stack([np.full_like(v, x), v], -1) for x in (0.0, camera.width - 1.0)]
+    xy = camera.rays(np.concatenate(border))[:, :2]
+    return 1.1 * float(np.nanmax((xy**2).sum(axis=-1)))

@@ -162,7 +162,7 @@ class McapFile:
         start, end = self._pread(0, 8), self._pread(max(0, self.size - 8), 8)
         if self.size == 0:
             raise BadInput(f"{self.path} is empty (0 bytes); wanted an MCAP file")
-        if start[: len(MAGIC)] != MAGIC[: len(start)] or self.size < 8:
+        if start != MAGIC[: len(start)]:
             raise BadInput(f"{self.path} is not an MCAP file: it begins with {start[:8]!r}")
         if end != MAGIC or self.size < 8 + 29 + 8:
             raise DamagedFile(

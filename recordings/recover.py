@@ -12,7 +12,7 @@ from mcap.records import Attachment, Metadata
 from recordings.documents import FORMAT_VERSION, as_dict, json_object
 from recordings.errors import BadInput, DamagedFile, WriteFailed
 from recordings.mcap_scan import Bytes
-from recordings.mcap_writer import LATEST_NS, McapWriter
+from recordings.mcap_writer import LATEST_NS, MAGIC, McapWriter
 from recordings.salvage import SavedMessage, Survey, saved, survey
 
 STOP = "tosslab.stop"
@@ -68,7 +68,7 @@ def recover_file(source: Path, out: Path) -> Recovered:
 
 
 def _begins_as_mcap(file: Bytes) -> bool:
-    return file.read(0, 8) == b"\x89MCAP0\r\n"
+    return MAGIC.startswith(file.read(0, 8))
 
 
 class _Rewriting:

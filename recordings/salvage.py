@@ -77,8 +77,10 @@ class _Walk:
         self.file = file
         self.found = Survey()
         self.chunks = 0
+        self.messages = 0
         self.after_bad_chunk = False
         self.found_again = False
+        self.lost_track = False
         self.statistics: Statistics | None = None
         self.doubtful: dict[type, dict[int, Schema] | dict[int, Channel]] = {Schema: {}, Channel: {}}
 
@@ -120,6 +122,7 @@ class _Walk:
 
     def _behind(self, record: Record, what: str) -> int:
         """Past a bad record: its end where another one begins there, else wherever one is found."""
+        self.lost_track = True
         try:
             mcap_scan.record_at(self.file, record.end)
         except ValueError:
@@ -129,9 +132,9 @@ class _Walk:
 
     def _skip(self, offset: int, what: str, from_byte: int | None = None) -> int:
         begin = offset + 1 if from_byte is None else from_byte
-        end = mcap_scan.find_again(self.file, begin, loose_messages=self.chunks == 0)
+        end = mcap_scan.find_again(self.file, begin, loose_messages=self.chunks == 0 and self.messages > 0)
         self.found.damage.append((offset, end, what))
-        self.found_again = True
+        self.found_again = self.lost_track = True
         return end
 
     def _take(self, record: Record) -> None:
@@ -147,10 +150,12 @@ class _Walk:
             self._define(mcap_scan.parse(record, Channel))
         elif opcode == Opcode.ATTACHMENT:
             mcap_scan.parse_attachment(record)
+            if found.profile == "tosslab" and record.body[-4:] == bytes(4):
+                raise ValueError("an attachment without its CRC, which tosslab always writes")
         elif opcode == Opcode.METADATA:
             mcap_scan.parse(record, Metadata)
-        elif opcode == Opcode.MESSAGE and len(record.body) < MESSAGE.size:
-            raise ValueError(f"a message of {len(record.body)} bytes at byte {record.offset}")
+        elif opcode == Opcode.MESSAGE:
+            self._loose_message(record)
         elif opcode == Opcode.MESSAGE_INDEX and self.after_bad_chunk:
             index = mcap_scan.parse(record, MessageIndex)
             found.lost[index.channel_id] = found.lost.get(index.channel_id, 0) + len(index.records)
@@ -162,8 +167,18 @@ class _Walk:
         if opcode in _KEPT:
             found.offsets.append(record.offset)
 
+    def _loose_message(self, record: Record) -> None:
+        """A message outside of chunks has no CRC: amid damage it is believed only in a file that has no chunks."""
+        if len(record.body) < MESSAGE.size:
+            raise ValueError(f"a message of {len(record.body)} bytes at byte {record.offset}")
+        if self.lost_track and (self.chunks or not self.messages):
+            raise ValueError(f"what looks like a message at byte {record.offset}, outside of the chunks")
+        self.messages += 1
+
     def _chunk(self, record: Record) -> None:
         chunk = mcap_scan.parse_chunk(record)
+        if chunk.crc == 0 and self.found.profile == "tosslab":
+            raise ValueError("a chunk without its CRC, which tosslab always writes")
         definitions: list[Schema | Channel] = []
         for opcode, _, body in mcap_scan.chunk_records(chunk.raw):
             if opcode == Opcode.SCHEMA:

@@ -173,7 +173,7 @@ class Toss:
         def load(i: int) -> RgbdFrame:
             image = colors[i]
             rgb: Array = codec.decode_image(image)
-            depth_m = np.zeros(rgb.shape[:2], dtype=np.float32)
+            depth_m: Array = np.zeros(rgb.shape[:2], dtype=np.float32)
             if paired[i]:
                 depth_m = aligner(depth_in_metres(depths[int(pairs[i])]))
             if depth_m.shape != rgb.shape[:2]:

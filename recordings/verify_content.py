@@ -159,8 +159,8 @@ class _Content:
         unused = len(depth_ns) - (len(color_ns) - alone)
         if alone or unused:
             text = (
-                f"{camera}: {len(color_ns)} colour and {len(depth_ns)} depth images; {alone} colour images have no depth "
-                f"near enough in time, {unused} depth images no colour"
+                f"{camera}: {len(color_ns)} colour and {len(depth_ns)} depth images; {alone} colour images have no "
+                f"depth near enough in time, {unused} depth images no colour"
             )
             yield self._finding("warning", text)
 
