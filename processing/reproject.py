@@ -85,7 +85,7 @@ class DrakeRenderer:
     name = "drake"
     WIDER = 1.15
     """How much wider than the distorted image the ideal one is drawn."""
-    DENSER = 3
+    DENSER = 3.0
     """How many of its pixels lie along one of the distorted image's, so that the outline is as sharp."""
 
     def __init__(self, shape: ObjectShape, camera: CameraModel) -> None:
@@ -101,7 +101,8 @@ class DrakeRenderer:
         import trimesh
 
         self._camera = camera
-        self._ideal = camera if camera.distortion_model == "none" else _ideal_camera(camera, self.WIDER).scaled(self.DENSER)
+        straight = camera.distortion_model == "none"
+        self._ideal = camera if straight else _ideal_camera(camera, self.WIDER).scaled(self.DENSER)
         self._folder = tempfile.TemporaryDirectory()
         path = f"{self._folder.name}/shape.obj"
         trimesh.Trimesh(shape.vertices_m, shape.faces, process=False).export(path, include_normals=True)
