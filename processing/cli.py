@@ -1,0 +1,174 @@
+"""`toss-process`: a session in, the object's shape and poses out, with honest scores."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from processing.variants import CONTACT_ONLY, NAMES, default_name, find_variant
+from recordings.console import Outcome, Parser, command_parser, progress_for, run_command
+from recordings.errors import BadInput, TosslabError
+
+if TYPE_CHECKING:
+    from recordings.session import Session
+
+TRACKERS = ("frame-to-model",)
+SAMPLE = "sample"
+SAMPLE_FOLDER = Path("samples") / "box_toss"
+CONTACT = "processing.contact.command"
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """The command's entry point; returns its exit code."""
+    return run_command(_parser(), argv)
+
+
+def _parser() -> Parser:
+    parser = command_parser(
+        "toss-process",
+        "Turn a session into the object's shape, its pose in every frame and its contact dynamics, and score them.\n"
+        "A run that was stopped goes on where it was: finished stages are read, not run again.",
+        "toss-process                                          # the shipped sample",
+        "toss-process sessions/cube --out results/cube --truth recordings/cube_dev_truth",
+    )
+    parser.add_argument(
+        "sessions", metavar="SESSION", nargs="*", help="session folders, one .mcap file, or `sample` (the default)"
+    )
+    parser.add_argument("--variant", metavar="NAME", help=f"a row of the table: {', '.join(NAMES)}")
+    parser.add_argument("--scope", choices=("one", "all"), default="all", help="each toss alone, or all (default)")
+    parser.add_argument("--toss", metavar="I|I-J", help="only these tosses")
+    parser.add_argument(
+        "--out", metavar="DIR", type=Path, help="results folder (SESSION/results; of several sessions DIR/<name>)"
+    )
+    parser.add_argument("--truth", metavar="DIR", type=Path, help="truth/ or a *_truth folder, opened for scores only")
+    parser.add_argument("--model", metavar="RESULTS", type=Path, help="track with a shape that was learned before")
+    parser.add_argument("--tracker", metavar="NAME", default="frame-to-model", help=f"one of: {', '.join(TRACKERS)}")
+    parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="cpu (default) or cuda")
+    if find_spec(CONTACT):
+        import_module(CONTACT).add_arguments(parser)
+    parser.set_defaults(work=_work)
+    return parser
+
+
+def _work(args: argparse.Namespace) -> Outcome:
+    name = args.variant or default_name()
+    if name != CONTACT_ONLY or not find_spec(CONTACT):
+        find_variant(name)  # refuses by name, before anything is read
+        _refuse_what_is_not_there(args)
+    sessions = [_session_path(s) for s in args.sessions] or [_sample_path()]
+    if len(sessions) > 1 and args.truth is not None:
+        raise BadInput("--truth DIR belongs to one session; with several, each one's own truth/ is used")
+    outcomes = [_process_one(args, path, name, len(sessions) > 1) for path in sessions]
+    if len(outcomes) == 1:
+        return outcomes[0]
+    worst = max(o.exit_code for o in outcomes)
+    return Outcome({"sessions": [o.document for o in outcomes]}, "\n\n".join(o.text for o in outcomes), worst)
+
+
+def _refuse_what_is_not_there(args: argparse.Namespace) -> None:
+    if args.tracker not in TRACKERS:
+        raise BadInput(f"there is no tracker '{args.tracker}'; available: {', '.join(TRACKERS)}")
+    if args.model is not None:
+        raise BadInput("--model needs the tracker that uses a learned shape: not there yet; run without --model")
+    if args.device == "cuda":
+        raise BadInput(f"--device cuda: the tracker {args.tracker} runs on the CPU only; run without --device")
+
+
+def _session_path(given: str) -> Path:
+    return _sample_path() if given == SAMPLE and not Path(given).exists() else Path(given)
+
+
+def _sample_path() -> Path:
+    import recordings
+
+    path = Path(recordings.__file__).parent / SAMPLE_FOLDER
+    if not path.exists():
+        raise BadInput(f"the shipped sample is not at {path}; name a session: toss-process SESSION")
+    return path
+
+
+def _process_one(args: argparse.Namespace, path: Path, name: str, several: bool) -> Outcome:
+    """One session. Of several, one that fails does not stop the others."""
+    try:
+        return _process(args, path, name, several)
+    except TosslabError as wrong:
+        if not several:
+            raise
+        return Outcome({"session": str(path), "error": str(wrong)}, f"{path}: {wrong}", wrong.exit_code)
+
+
+def _process(args: argparse.Namespace, path: Path, name: str, several: bool) -> Outcome:
+    from recordings.session import Session
+
+    session = Session.open(path)
+    try:
+        out = _out_folder(args, session, several)
+        if name == CONTACT_ONLY:
+            return _contact_only(args, session, out)
+        return _vision(args, session, name, out)
+    finally:
+        session.close()
+
+
+def _vision(args: argparse.Namespace, session: Session, name: str, out: Path) -> Outcome:
+    from processing.config import Config
+    from processing.pipeline import process, start_run
+
+    tosses = chosen_tosses(args.toss, session.tosses)
+    run = start_run(session, tosses, out, Config(), args.tracker, progress_for)
+    process(run, find_variant(name), args.scope)
+    return _evaluate(args, session, out)  # the door to truth is opened after every track and shape is written
+
+
+def _evaluate(args: argparse.Namespace, session: Session, out: Path) -> Outcome:
+    """Scores of all variants in the results folder, table and report."""
+    from processing.report import write_report
+    from processing.score import score_variant
+    from processing.table import collect, markdown, write_table
+    from processing.truth import open_truth
+    from recordings.results import Results
+
+    results = Results.open(out)
+    scores = {}
+    for variant in results.variants():
+        record = results.find(*variant)
+        truth = open_truth(args.truth, session, record)
+        if truth is not None:
+            scores[variant] = score_variant(results, record, truth)
+    rows = collect(results, scores)
+    document = write_table(results, rows)
+    write_report(results, document, rows, session)
+    text = f"{markdown(document)}\nresults: {out}\nreport:  {out / 'report.html'}"
+    return Outcome({"session": session.name, "results": str(out), **document}, text)
+
+
+def _contact_only(args: argparse.Namespace, session: Session, out: Path) -> Outcome:
+    if not find_spec(CONTACT):
+        raise BadInput("variant contact-only needs contact learning: not there yet")
+    outcome: Any = import_module(CONTACT).run(args, session, out, progress_for("contact-only"))
+    return outcome if isinstance(outcome, Outcome) else Outcome({"results": str(out)}, f"results: {out}")
+
+
+def _out_folder(args: argparse.Namespace, session: Session, several: bool) -> Path:
+    """DESIGN section 4: --out DIR is itself the results folder; by default SESSION/results, of one file beside it."""
+    if args.out is not None:
+        return args.out / session.path.resolve().stem if several else args.out
+    path = session.path
+    return path / "results" if path.is_dir() else path.with_name(f"{path.stem}_results")
+
+
+def chosen_tosses(given: str | None, there: Sequence[int]) -> list[int]:
+    """`--toss I` or `I-J`. Raises BadInput where nothing fits."""
+    if given is None:
+        return list(there)
+    first, _, last = given.partition("-")
+    if not first.isdigit() or (last and not last.isdigit()) or (given.endswith("-")):
+        raise BadInput(f"--toss {given}: wanted a toss number or a range, for example --toss 3 or --toss 0-8")
+    chosen = [t for t in there if int(first) <= t <= int(last or first)]
+    if not chosen:
+        raise BadInput(f"--toss {given}: the session has the tosses {', '.join(map(str, there)) or '(none)'}")
+    return chosen

@@ -1,0 +1,164 @@
+"""How good a track and a shape are against the truth, with the definitions that BundleSDF's benchmark uses.
+
+ADD, ADD-S: area under the recall curve between 0 and 0.1 m, exact, in percent of all frames; a lost frame counts
+as an infinite error. ADD-S runs from each true point to the nearest estimated one. Success: within 5 deg and 5 cm.
+Chamfer: half the sum of the mean distances of 30,000 surface samples of either mesh to the other's surface.
+Alignment of an estimate (whose object frame is arbitrary) happens before, in `align_first` and `icp_align`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray as Array
+
+from recordings.geometry import rotation_angle_rad
+
+if TYPE_CHECKING:
+    import trimesh
+
+ADD_LIMIT_M = 0.1
+POINTS = 2_000
+SURFACE_POINTS = 30_000
+FLIPPED_DEG = 45.0
+
+
+@dataclass(frozen=True, eq=False)
+class FrameErrors:
+    """Errors of every frame that has a true pose; infinite where the estimate is lost."""
+
+    add_m: Float[Array, " n"]
+    adds_m: Float[Array, " n"]
+    rotation_deg: Float[Array, " n"]
+    translation_m: Float[Array, " n"]
+
+    @property
+    def success(self) -> Float[Array, " n"]:
+        return ((self.rotation_deg < 5) & (self.translation_m < 0.05)).astype(np.float64)
+
+    @staticmethod
+    def pooled(parts: list[FrameErrors]) -> FrameErrors:
+        """The frames of several tosses as one set."""
+        names = ("add_m", "adds_m", "rotation_deg", "translation_m")
+        return FrameErrors(*(np.concatenate([getattr(p, n) for p in parts]) for n in names))
+
+
+def align_first(estimate: Float[Array, "n 4 4"], truth: Float[Array, "n 4 4"]) -> Float[Array, "4 4"] | None:
+    """estimated_object_from_true_object that makes the first frame known to both equal; None where there is none."""
+    known = np.isfinite(estimate[:, 0, 0]) & np.isfinite(truth[:, 0, 0])
+    if not known.any():
+        return None
+    first = int(np.flatnonzero(known)[0])
+    return np.linalg.inv(estimate[first]) @ truth[first]
+
+
+def frame_errors(
+    aligned: Float[Array, "n 4 4"], truth: Float[Array, "n 4 4"], points_m: Float[Array, "p 3"]
+) -> FrameErrors:
+    """Errors of aligned estimates in the frames that have a true pose."""
+    from scipy.spatial import cKDTree
+
+    rows = []
+    for e, t in zip(aligned, truth):
+        if not np.isfinite(t).all():
+            continue
+        if not np.isfinite(e).all():
+            rows.append((np.inf,) * 4)
+            continue
+        estimated, true = points_m @ e[:3, :3].T + e[:3, 3], points_m @ t[:3, :3].T + t[:3, 3]
+        add = float(np.linalg.norm(estimated - true, axis=1).mean())
+        adds = float(cKDTree(estimated).query(true)[0].mean())
+        angle = float(np.degrees(rotation_angle_rad(e[:3, :3] @ t[:3, :3].T)))
+        rows.append((add, adds, angle, float(np.linalg.norm(e[:3, 3] - t[:3, 3]))))
+    table = np.array(rows, dtype=np.float64).reshape(-1, 4)
+    return FrameErrors(*table.T)
+
+
+def auc_percent(errors_m: Float[Array, " n"], limit_m: float = ADD_LIMIT_M) -> float:
+    """Area under the recall curve of the errors between 0 and the limit, in percent; infinite ones never count.
+
+    The exact sum over the sorted errors, without bins. As in YCB-Video's tools, the recall between two errors is the
+    later one's: for n frames this is above the left-hand sum by at most 100 / n points.
+    """
+    if len(errors_m) == 0:
+        return float("nan")
+    ordered = np.sort(np.nan_to_num(errors_m, nan=np.inf, posinf=np.inf))
+    recall = np.arange(1, len(ordered) + 1) / len(ordered)
+    inside = ordered < limit_m
+    if not inside.any():
+        return 0.0
+    at = np.concatenate([[0.0], ordered[inside], [limit_m]])
+    height = np.concatenate([recall[inside], recall[inside][-1:]])
+    return float(100 * (np.diff(at) * height).sum() / limit_m)
+
+
+def surface_points(mesh: trimesh.Trimesh, count: int) -> Float[Array, "n 3"]:
+    """Area-uniform samples of a surface, the same ones every time."""
+    import trimesh
+
+    return np.asarray(trimesh.sample.sample_surface(mesh, count, seed=0)[0], dtype=np.float64)
+
+
+def distance_to_surface_m(mesh: trimesh.Trimesh, points_m: Float[Array, "n 3"]) -> Float[Array, " n"]:
+    """Distance of each point to the nearest triangle."""
+    import open3d
+
+    scene = open3d.t.geometry.RaycastingScene()
+    tensor = open3d.core.Tensor
+    scene.add_triangles(tensor(mesh.vertices.astype(np.float32)), tensor(mesh.faces.astype(np.uint32)))
+    return scene.compute_distance(tensor(points_m.astype(np.float32))).numpy().astype(np.float64)
+
+
+@dataclass(frozen=True)
+class Chamfer:
+    """Mean distances of two surfaces in metres, either way, and the share of points within 5 mm as an F-score."""
+
+    estimate_to_truth_m: float
+    truth_to_estimate_m: float
+    f_score_5mm: float
+
+    @property
+    def cm(self) -> float:
+        """Half the sum of both directions, in centimetres."""
+        return 50 * (self.estimate_to_truth_m + self.truth_to_estimate_m)
+
+
+def chamfer(estimate: trimesh.Trimesh, truth: trimesh.Trimesh, count: int = SURFACE_POINTS) -> Chamfer:
+    """Distances of surface samples of either mesh to the other's surface."""
+    there = distance_to_surface_m(truth, surface_points(estimate, count))
+    back = distance_to_surface_m(estimate, surface_points(truth, count))
+    precision, recall = float((there < 0.005).mean()), float((back < 0.005).mean())
+    f_score = 2 * precision * recall / max(precision + recall, 1e-12)
+    return Chamfer(float(there.mean()), float(back.mean()), f_score)
+
+
+def icp_align(
+    source_m: Float[Array, "n 3"], target_m: Float[Array, "m 3"], steps: int = 60, share: float = 0.95
+) -> Float[Array, "4 4"]:
+    """Rigid motion that lays source points on target points: point to point, the best `share` of the pairs."""
+    from scipy.spatial import cKDTree
+
+    tree, moved, total = cKDTree(target_m), source_m.copy(), np.eye(4)
+    for _ in range(steps):
+        distance, nearest = tree.query(moved)
+        use = distance <= np.quantile(distance, share)
+        step = _kabsch(moved[use], target_m[nearest[use]])
+        total = step @ total
+        after = source_m @ total[:3, :3].T + total[:3, 3]
+        if float(np.abs(after - moved).max()) < 1e-7:
+            break
+        moved = after
+    return total
+
+
+def _kabsch(source_m: Float[Array, "n 3"], target_m: Float[Array, "n 3"]) -> Float[Array, "4 4"]:
+    """The rigid motion that moves paired points onto each other with least squares (Kabsch 1976)."""
+    a, b = source_m.mean(0), target_m.mean(0)
+    u, _, vt = np.linalg.svd((source_m - a).T @ (target_m - b))
+    turn = vt.T @ np.diag([1, 1, np.sign(np.linalg.det(vt.T @ u.T))]) @ u.T
+    out = np.eye(4)
+    out[:3, :3], out[:3, 3] = turn, b - turn @ a
+    return out

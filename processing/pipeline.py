@@ -1,0 +1,173 @@
+"""The pipeline on one screen: plain calls, each of which reads its stage's folder first. Scores come afterwards.
+
+What the ground truth says is never asked here: see truth.py.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from processing.config import Config
+from processing.segment.background import BackgroundSegmenter
+from processing.segment.segmenter import Example
+from processing.segment.static_scene import StaticScene, calibrated_table_depth, learn_scene, sample_positions
+from processing.stage import Counts, Done, Store
+from processing.track.frame_to_model import FrameToModel
+from processing.variants import Variant
+from recordings.errors import BadInput
+from recordings.progress import Progress
+from recordings.results import (
+    Scope,
+    TossRecord,
+    VariantRecord,
+    read_masks,
+    write_masks,
+    write_shape,
+    write_track,
+    write_variant,
+)
+from recordings.session import Session
+from recordings.session_writer import file_sha256
+
+CAMERA = "d455"
+MakeProgress = Callable[[str], Progress]
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """One session being processed into one results folder. `tosses` are those that take part in anything."""
+
+    session: Session
+    tosses: tuple[int, ...]
+    store: Store
+    config: Config
+    tracker: str
+    progress: MakeProgress
+    keys: Mapping[str, str]
+
+
+def start_run(
+    session: Session, tosses: Sequence[int], results: Path, config: Config, tracker: str, progress: MakeProgress
+) -> Run:
+    """Check what the run needs and take the fingerprints of its inputs. Raises BadInput."""
+    if not tosses:
+        raise BadInput(f"{session.path} has no tosses; wanted a session with toss_00.mcap and so on")
+    if CAMERA not in session.calibration.cameras:
+        raise BadInput(
+            f"{session.path}: the calibration has no intrinsics of {CAMERA}; it has "
+            f"{sorted(session.calibration.cameras) or 'no camera'}. Vision needs them"
+        )
+    keys = {f"toss_{t:02d}": file_sha256(session.file(t)) for t in tosses}
+    calibration = json.dumps(session.calibration.to_json(), sort_keys=True).encode()
+    keys["calibration"] = hashlib.sha256(calibration).hexdigest()
+    return Run(session, tuple(tosses), Store(results), config, tracker, progress, keys)
+
+
+def process(run: Run, variant: Variant, scope: Scope) -> VariantRecord:
+    """Tracks and shapes of one variant, and the record of where they are."""
+    scene = static_scene(run)
+    tosses = []
+    for toss in run.tosses:
+        masks = object_masks(run, toss, scene)
+        once = first_pass(run, toss, masks)  # p_i, O_i
+        tosses.append(TossRecord(toss, once.name, once.name, masks.name))
+    record = VariantRecord(
+        name=variant.name,
+        scope=scope,
+        label=variant.label,
+        session_name=run.session.name,
+        object_name=run.session.object_name,
+        calibration=run.session.calibration,
+        tosses=tuple(tosses),
+        shape=tosses[0].shape if scope == "all" else None,
+        shared_object_frame=False,
+        session_path=os.path.relpath(run.session.path.resolve(), run.store.results.resolve()),
+        notes=(f"tracker: {run.tracker}", "each toss has its own object frame"),
+        extra={"tracker": run.tracker},
+    )
+    write_variant(run.store.results, record)
+    return record
+
+
+def static_scene(run: Run) -> Done:
+    """Stage `scene`: what the camera sees without the object, from frames of all tosses of the run."""
+    inputs = {name: run.keys[name] for name in ("calibration", *(f"toss_{t:02d}" for t in run.tosses))}
+    return run.store.run("scene", 1, run.config.scene, inputs, lambda folder: _learn_scene(run, folder))
+
+
+def _learn_scene(run: Run, folder: Path) -> Counts:
+    streams = [run.session.toss(t).rgbd(CAMERA) for t in run.tosses]
+    chosen = sample_positions([len(s) for s in streams], run.config.scene.frames)
+    progress = run.progress("static scene")
+
+    def frames():  # type: ignore[no-untyped-def]
+        for done, (toss, position) in enumerate(chosen):
+            progress.step(done, len(chosen))
+            yield streams[toss][position]
+
+    scene = learn_scene(frames(), calibrated_table_depth(run.session.calibration, CAMERA), run.config.scene)
+    with open(folder / "scene.npz", "wb") as out:
+        np.savez(out, **vars(scene))
+    return {"frames": len(chosen), "pixels_with_depth": int((scene.depth_m > 0).sum())}
+
+
+def object_masks(run: Run, toss: int, scene: Done) -> Done:
+    """Stage `segment`: the object's mask in every frame of one toss."""
+    name = f"toss_{toss:02d}"
+    inputs = {"scene": scene.key, name: run.keys[name], "calibration": run.keys["calibration"]}
+    given = run.session.toss(toss).masks()
+    first = {i: given[i] for i in sorted(given)[:1]}
+    shown = None if first else _toss_with_mask(run)
+    if shown is not None:
+        inputs["example"] = run.keys[f"toss_{shown:02d}"]
+
+    def compute(folder: Path) -> Counts:
+        with np.load(scene.folder / "scene.npz", allow_pickle=False) as stored:
+            learned = StaticScene(**stored)
+        frames = run.session.toss(toss).rgbd(CAMERA)
+        segmenter = BackgroundSegmenter(learned, run.session.calibration.camera(CAMERA), run.config.masks)
+        example = None if shown is None else _example(run, shown)
+        progress = run.progress(f"toss {toss}: masks")
+        found = sorted(segmenter.masks(frames, first, example, None, progress), key=lambda m: m.position)
+        write_masks(folder, toss, [m.mask for m in found], np.array([m.confidence for m in found]))
+        empty = sum(not m.mask.any() for m in found)
+        return {"frames": len(found), "empty": empty, "given": len(first), "without_depth": len(frames.without_depth)}
+
+    return run.store.run("segment", 1, run.config.masks, inputs, compute)
+
+
+def _toss_with_mask(run: Run) -> int | None:
+    """The first toss that came with a mask: it shows what the object looks like."""
+    return next((t for t in run.tosses if run.session.toss(t).masks()), None)
+
+
+def _example(run: Run, toss: int) -> Example:
+    position, mask = min(run.session.toss(toss).masks().items())
+    return Example(run.session.toss(toss).rgbd(CAMERA)[position], mask)
+
+
+def first_pass(run: Run, toss: int, masks: Done) -> Done:
+    """Stage `track`: poses and shape from one toss alone."""
+    name = f"toss_{toss:02d}"
+    inputs = {"masks": masks.key, name: run.keys[name], "calibration": run.keys["calibration"]}
+
+    def compute(folder: Path) -> Counts:
+        frames = run.session.toss(toss).rgbd(CAMERA)
+        camera = run.session.calibration.camera(CAMERA)
+        tracker = FrameToModel(run.config.frame_to_model)
+        tracked = tracker.track(
+            toss, frames, read_masks(masks.folder, toss), camera, f"object_{name}", run.progress(f"toss {toss}: poses")
+        )
+        write_track(folder, tracked.track)
+        write_shape(folder, tracked.shape)
+        lost = int(tracked.track.lost.sum())
+        return {"frames": len(frames), "lost": lost, "vertices": len(tracked.shape.vertices_m)}
+
+    return run.store.run("track", 1, {"tracker": run.tracker, **vars(run.config.frame_to_model)}, inputs, compute)

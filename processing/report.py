@@ -1,0 +1,158 @@
+"""report.html: one self-contained page with the table, pictures of the fitted mesh and the state of every toss."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Sequence
+from html import escape
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+from numpy import ndarray as Array
+
+from processing.table import COLUMNS, Row
+from recordings.geometry import CameraModel
+from recordings.results import Results
+from recordings.session import Session
+from recordings.session_writer import write_bytes
+from recordings.tracks import ObjectShape
+
+PICTURES = 6
+OUTLINE_RGB = (255, 40, 40)
+STYLE = """body{font:15px/1.5 system-ui,sans-serif;max-width:70em;margin:2em auto;padding:0 1em;color:#222}
+table{border-collapse:collapse;margin:1em 0}td,th{border:1px solid #ccc;padding:.25em .6em;text-align:right}
+td:first-child,th:first-child{text-align:left}th{background:#f3f3f3}.warn{background:#fff4d6;padding:.6em 1em}
+.paper{color:#888}figure{margin:1em 0}img{max-width:100%}.bar{display:inline-block;height:.8em}"""
+
+
+def write_report(results: Results, document: dict[str, Any], rows: Sequence[Row], session: Session) -> None:
+    """Write report.html into the results folder. It loads nothing from anywhere."""
+    warnings = [f"{r['variant']} ({r['scope']}): {w}" for r in document["rows"] for w in r["warnings"]]
+    parts = [
+        f"<h1>{escape(session.name)}: {escape(session.object_name)}</h1>",
+        _warnings([*warnings, *_lost(document)]),
+        _recorded(document),
+        "<h2>Scores</h2>",
+        _score_table(document),
+        *(_figure(results, row, session) for row in rows),
+        "<h2>Every toss</h2>",
+        *(_toss_table(r) for r in document["rows"]),
+    ]
+    page = (
+        f"<!doctype html><html lang=en><meta charset=utf-8><title>{escape(session.name)}</title>"
+        f"<style>{STYLE}</style><body>{''.join(parts)}</body></html>"
+    )
+    write_bytes(results.path / "report.html", page.encode())
+
+
+def _lost(document: dict[str, Any]) -> list[str]:
+    return [
+        f"{r['variant']} ({r['scope']}), toss {t['toss']}: {t['lost']} frames are lost"
+        for r in document["rows"]
+        for t in r["per_toss"]
+        if t["lost"]
+    ]
+
+
+def _warnings(lines: Sequence[str]) -> str:
+    return f"<div class=warn>{'<br>'.join(escape(line) for line in lines)}</div>" if lines else ""
+
+
+def _recorded(document: dict[str, Any]) -> str:
+    if not document["rows"]:
+        return ""
+    tosses = document["rows"][0]["per_toss"]
+    frames = sum(t["tracked"] + t["interpolated"] + t["lost"] for t in tosses)
+    return f"<p>{len(tosses)} tosses, {frames} colour and depth frames.</p>"
+
+
+def _score_table(document: dict[str, Any]) -> str:
+    head = "".join(f"<th>{escape(title)}</th>" for _, title in COLUMNS)
+    body = ""
+    for row in document["rows"]:
+        cells = "".join(f"<td>{_cell(row, name)}</td>" for name, _ in COLUMNS)
+        body += f"<tr><td>{escape(row['variant'])} ({row['scope']})</td>{cells}</tr>"
+    return (
+        f"<table><tr><th>variant</th>{head}</tr>{body}</table><p>ADD, ADD-S: area under the recall curve, 0 to 0.1 m. "
+        "SR: share of frames within 5 degrees and 5 cm. CD: Chamfer distance of the shape. Each toss is aligned at its "
+        "first frame. <span class=paper>Grey: the paper's figure for this row, on another data set.</span></p>"
+    )
+
+
+def _cell(row: dict[str, Any], name: str) -> str:
+    value, paper = row["values"].get(name), (row["paper"] or {}).get(name)
+    number = None if value is None else value["value"]
+    text = "–" if number is None else f"{number:.3f}" if value["unit"] == "cm" else f"{number:.2f}"
+    return text + ("" if paper is None else f" <span class=paper>{paper:g}</span>")
+
+
+def _toss_table(row: dict[str, Any]) -> str:
+    names = [n for n in ("adds_auc", "add_auc", "success_5deg_5cm") if any(n in t for t in row["per_toss"])]
+    head = "".join(f"<th>{n}</th>" for n in ("toss", "tracked", "interpolated", "lost", *names))
+    body = "".join(
+        f"<tr><td>{t['toss']}</td>"
+        + "".join(f"<td>{t[s]}</td>" for s in ("tracked", "interpolated", "lost"))
+        + "".join("<td>–</td>" if t.get(n) is None else f"<td>{t[n]:.1f}</td>" for n in names)
+        + "</tr>"
+        for t in row["per_toss"]
+    )
+    return f"<h3>{escape(row['label'])} ({row['scope']})</h3><table><tr>{head}</tr>{body}</table>"
+
+
+def _figure(results: Results, row: Row, session: Session) -> str:
+    picture = outline_picture(results, row, session)
+    ok, data = cv2.imencode(".jpg", picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 88])
+    if not ok:
+        return ""
+    coded = base64.b64encode(data.tobytes()).decode()
+    caption = "The estimated shape's outline at its estimated pose, over the images. Frames that are lost show none."
+    name = f"{row.record.label} (scope {row.record.scope})"
+    return (
+        f"<figure><h2>{escape(name)}</h2><img alt='outlines' src='data:image/jpeg;base64,{coded}'>"
+        f"<figcaption>{caption}</figcaption></figure>"
+    )
+
+
+def outline_picture(results: Results, row: Row, session: Session) -> UInt8[Array, "h w 3"]:
+    """Frames from up to PICTURES tosses (or from one toss alone) with the mesh's outline, side by side."""
+    tosses = list(row.tracks)
+    chosen = [tosses[i] for i in np.unique(np.linspace(0, len(tosses) - 1, min(3, len(tosses))).round().astype(int))]
+    tiles = []
+    for toss in chosen:
+        track, frames = row.tracks[toss], session.toss(toss).rgbd()
+        shape = results.shape(row.record.name, row.record.scope, toss)
+        camera = row.record.calibration.camera(track.camera)
+        for share in np.linspace(0.3, 0.95, PICTURES // len(chosen)):
+            position = int(share * (len(frames) - 1))
+            image, pose = frames[position].color_rgb.copy(), track.camera_from_object[position]
+            if np.isfinite(pose).all():
+                draw_outline(image, silhouette(shape, pose, camera))
+            cv2.putText(
+                image, f"toss {toss}, frame {position}", (8, 22), cv2.FONT_HERSHEY_SIMPLEX, 0.6, (255, 255, 255), 2
+            )
+            tiles.append(image)
+    columns = 3 if len(tiles) >= 3 else len(tiles)
+    blank = np.zeros_like(tiles[0])
+    tiles += [blank] * (-len(tiles) % columns)
+    return np.vstack([np.hstack(tiles[i : i + columns]) for i in range(0, len(tiles), columns)])
+
+
+def draw_outline(image_rgb: UInt8[Array, "h w 3"], mask: Bool[Array, "h w"]) -> None:
+    """Draw a mask's outline into an image."""
+    contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+    cv2.drawContours(image_rgb, contours, -1, OUTLINE_RGB, 1)
+
+
+def silhouette(shape: ObjectShape, camera_from_object: Float[Array, "4 4"], camera: CameraModel) -> Bool[Array, "h w"]:
+    """Pixels whose ray, through the lens as it is, meets the shape at this pose."""
+    import open3d
+
+    scene = open3d.t.geometry.RaycastingScene()
+    points = shape.vertices_m @ camera_from_object[:3, :3].T + camera_from_object[:3, 3]
+    tensor = open3d.core.Tensor
+    scene.add_triangles(tensor(points.astype(np.float32)), tensor(shape.faces.astype(np.uint32)))
+    directions = np.nan_to_num(camera.pixel_rays(), nan=0.0).astype(np.float32)
+    rays = np.concatenate([np.zeros_like(directions), directions], -1)
+    return np.isfinite(scene.cast_rays(tensor(rays))["t_hit"].numpy())

@@ -1,0 +1,177 @@
+"""Scores of a variant against the truth, from the files in the results folder."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray as Array
+
+from processing.metrics import (
+    FLIPPED_DEG,
+    POINTS,
+    SURFACE_POINTS,
+    Chamfer,
+    FrameErrors,
+    align_first,
+    auc_percent,
+    chamfer,
+    frame_errors,
+    icp_align,
+    surface_points,
+)
+from processing.truth import Truth
+from recordings.errors import BadInput
+from recordings.results import Results, VariantRecord
+from recordings.tracks import ObjectShape, ObjectTrack
+
+if TYPE_CHECKING:
+    import trimesh
+
+
+@dataclass(frozen=True)
+class Value:
+    """One number of the table: with its unit, how many it is from, and what was aligned to what."""
+
+    value: float
+    unit: str
+    n: int
+    aligned: str
+
+
+@dataclass(frozen=True, eq=False)
+class TossScore:
+    """Scores of one toss, aligned at its own first frame."""
+
+    toss: int
+    errors: FrameErrors
+    lost: int
+
+
+@dataclass(frozen=True, eq=False)
+class VariantScore:
+    """Values by name, per-toss scores, and what could not be scored and why."""
+
+    values: dict[str, Value]
+    tosses: tuple[TossScore, ...]
+    warnings: tuple[str, ...] = field(default=())
+
+
+def score_variant(results: Results, record: VariantRecord, truth: Truth) -> VariantScore:
+    """All scores of one variant that the truth allows."""
+    mesh = _true_mesh(truth)
+    if mesh is None:
+        return VariantScore({}, (), (f"{truth.folder} has no mesh.obj: ADD and Chamfer cannot be scored",))
+    points = surface_points(mesh, POINTS)
+    tracks = results.tracks(record.name, record.scope)
+    tosses, shifts, warnings = [], {}, []
+    for toss, track in tracks.items():
+        true = truth.camera_from_object(track)
+        shift = None if true is None else align_first(track.camera_from_object, true)
+        if true is None or shift is None:
+            warnings.append(f"toss {toss}: no frame has both a true and an estimated pose; not scored")
+            continue
+        shifts[toss] = shift
+        errors = frame_errors(track.camera_from_object @ shift, true, points)
+        tosses.append(TossScore(toss, errors, int(track.lost.sum())))
+    if not tosses:
+        return VariantScore({}, (), tuple(warnings))
+    values = pose_values(FrameErrors.pooled([t.errors for t in tosses]), "each toss at its own first frame")
+    values["lost_frames"] = Value(sum(t.lost for t in tosses), "frames", sum(len(t.lost) for t in tracks.values()), "")
+    if record.shared_object_frame:
+        values |= _with_one_alignment(tracks, truth, points, shifts[min(shifts)])
+    values |= shape_values(results, record, shifts, mesh)
+    return VariantScore(values, tuple(tosses), tuple(warnings))
+
+
+def pose_values(e: FrameErrors, aligned: str, prefix: str = "") -> dict[str, Value]:
+    """AUCs, success rate, median and 90 % errors over all frames."""
+    n = len(e.add_m)
+    figures = {
+        "adds_auc": (auc_percent(e.adds_m), "%"),
+        "add_auc": (auc_percent(e.add_m), "%"),
+        "success_5deg_5cm": (100 * float(e.success.mean()), "%"),
+        "median_rotation": (_quantile(e.rotation_deg, 0.5), "deg"),
+        "p90_rotation": (_quantile(e.rotation_deg, 0.9), "deg"),
+        "median_translation": (1000 * _quantile(e.translation_m, 0.5), "mm"),
+        "p90_translation": (1000 * _quantile(e.translation_m, 0.9), "mm"),
+        "flipped_frames": (float((np.isfinite(e.rotation_deg) & (e.rotation_deg > FLIPPED_DEG)).sum()), "frames"),
+    }
+    return {prefix + name: Value(value, unit, n, aligned) for name, (value, unit) in figures.items()}
+
+
+def _quantile(values: Float[Array, " n"], share: float) -> float:
+    """Lower quantile, so that infinite errors of lost frames never become NaN."""
+    return float(np.quantile(values, share, method="lower"))
+
+
+def _with_one_alignment(
+    tracks: dict[int, ObjectTrack], truth: Truth, points_m: Float[Array, "p 3"], shift: Float[Array, "4 4"]
+) -> dict[str, Value]:
+    parts = []
+    for track in tracks.values():
+        true = truth.camera_from_object(track)
+        if true is not None:
+            parts.append(frame_errors(track.camera_from_object @ shift, true, points_m))
+    return pose_values(FrameErrors.pooled(parts), "all tosses at the first toss's first frame", "global_")
+
+
+def shape_values(
+    results: Results, record: VariantRecord, shifts: dict[int, Float[Array, "4 4"]], truth: trimesh.Trimesh
+) -> dict[str, Value]:
+    """Chamfer distances: of the variant's one shape, or the mean over the tosses' own (scope one)."""
+    if record.scope == "all":
+        first = _first_in_frame_of(results, record, shifts)
+        pairs = [(results.shape(record.name, "all"), shifts[first])] if first is not None else []
+        where = f"first frame of toss {first}"
+    else:
+        pairs = [(results.shape(record.name, "one", t), shift) for t, shift in shifts.items()]
+        where = "each toss's first frame, mean over tosses"
+    scored = [_chamfers(shape, shift, truth) for shape, shift in pairs if len(shape.faces)]
+    if not scored:
+        return {}
+    placed, fitted = [a for a, _ in scored], [b for _, b in scored]
+    n = len(scored)
+    return {
+        "cd": Value(_mean([c.cm for c in placed]), "cm", n, where),
+        "cd_icp": Value(_mean([c.cm for c in fitted]), "cm", n, f"{where}, then rigid ICP"),
+        "cd_icp_estimate_to_truth": Value(_mean([100 * c.estimate_to_truth_m for c in fitted]), "cm", n, "rigid ICP"),
+        "cd_icp_truth_to_estimate": Value(_mean([100 * c.truth_to_estimate_m for c in fitted]), "cm", n, "rigid ICP"),
+        "f_score_5mm": Value(100 * _mean([c.f_score_5mm for c in fitted]), "%", n, "rigid ICP"),
+    }
+
+
+def _first_in_frame_of(results: Results, record: VariantRecord, shifts: dict[int, Float[Array, "4 4"]]) -> int | None:
+    """The first scored toss whose track is in the shape's object frame."""
+    frame = results.shape(record.name, record.scope).object_frame
+    tracks = results.tracks(record.name, record.scope)
+    return next((t for t in sorted(shifts) if tracks[t].object_frame == frame), None)
+
+
+def _chamfers(shape: ObjectShape, shift: Float[Array, "4 4"], truth: trimesh.Trimesh) -> tuple[Chamfer, Chamfer]:
+    """Chamfer after the alignment of the poses, and after a further rigid ICP."""
+    import trimesh
+
+    mesh = trimesh.Trimesh(shape.vertices_m, shape.faces, process=False)
+    mesh.apply_transform(np.linalg.inv(shift))
+    placed = chamfer(mesh, truth)
+    mesh.apply_transform(icp_align(surface_points(mesh, SURFACE_POINTS), surface_points(truth, SURFACE_POINTS)))
+    return placed, chamfer(mesh, truth)
+
+
+def _mean(values: list[float]) -> float:
+    return float(np.mean(values))
+
+
+def _true_mesh(truth: Truth) -> trimesh.Trimesh | None:
+    import trimesh
+
+    if truth.mesh_path is None:
+        return None
+    try:
+        mesh = trimesh.load(truth.mesh_path, force="mesh", process=False)
+    except (ValueError, OSError) as wrong:
+        raise BadInput(f"{truth.mesh_path} cannot be read as a mesh ({wrong})") from wrong
+    return mesh

@@ -1,0 +1,173 @@
+"""Run once, resume always: a stage computes into `<stage>-<key8>.partial` and is renamed when whole.
+
+The key covers the stage's name and version, its settings and the keys of its inputs; a name alone never decides what
+may be reused. Two runs on one results folder meet at a lock per stage: the second waits and reads what the first made.
+"""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import hashlib
+import json
+import os
+import shutil
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, is_dataclass
+from pathlib import Path
+from typing import Any
+
+from recordings.errors import BadInput, WriteFailed
+
+Counts = Mapping[str, Any]
+NO_SPACE = (errno.ENOSPC, errno.EDQUOT)
+SHOWN = 8
+"""Characters of the key in a folder's name."""
+
+
+@dataclass(frozen=True)
+class Done:
+    """A finished stage: its folder, its whole key, what it counted, and whether it was read rather than run."""
+
+    folder: Path
+    key: str
+    counts: Counts
+    reused: bool
+
+    @property
+    def name(self) -> str:
+        """The folder's name, as variants refer to it."""
+        return self.folder.name
+
+
+def fingerprint(stage: str, version: int, config: Any, inputs: Mapping[str, str]) -> str:
+    """sha256 of everything that decides a stage's output. `config` is a dataclass or JSON values."""
+    content = {"stage": stage, "version": version, "config": plain(config), "inputs": dict(inputs)}
+    return hashlib.sha256(json.dumps(content, sort_keys=True, allow_nan=False).encode()).hexdigest()
+
+
+def plain(config: Any) -> Any:
+    """Settings as JSON values."""
+    return asdict(config) if is_dataclass(config) and not isinstance(config, type) else config
+
+
+class Store:
+    """A results folder in which stages are run or found."""
+
+    def __init__(self, results: Path) -> None:
+        self.results = results
+        with _spoken(results):
+            results.mkdir(parents=True, exist_ok=True)
+            if not os.access(results, os.W_OK):
+                raise BadInput(f"{results} cannot be written to; choose another place with --out DIR")
+
+    def run(
+        self,
+        stage: str,
+        version: int,
+        config: Any,
+        inputs: Mapping[str, str],
+        compute: Callable[[Path], Counts],
+    ) -> Done:
+        """The finished stage: read where it is there, computed where not.
+
+        `compute(folder)` writes the stage's files and returns what it counted.
+        Raises WriteFailed when the disk is full; whatever interrupts it leaves no half stage behind.
+        """
+        key = fingerprint(stage, version, config, inputs)
+        folder = self.results / f"{stage}-{key[:SHOWN]}"
+        if (found := _finished(folder, key)) is not None:
+            return found
+        with _spoken(self.results), _locked(self.results / f".{folder.name}.lock"):
+            if (found := _finished(folder, key)) is not None:  # made by another run while this one waited
+                return found
+            partial = folder.with_name(folder.name + ".partial")
+            shutil.rmtree(partial, ignore_errors=True)  # of a run that was killed: the lock says that it is gone
+            partial.mkdir()
+            try:
+                counts = _timed(partial, compute, {"stage": stage, "version": version, "key": key}, config, inputs)
+                partial.rename(folder)
+            except BaseException:
+                shutil.rmtree(partial, ignore_errors=True)
+                raise
+        return Done(folder, key, counts, reused=False)
+
+
+def _timed(
+    partial: Path, compute: Callable[[Path], Counts], about: Mapping[str, Any], config: Any, inputs: Mapping[str, str]
+) -> Counts:
+    """Compute, then write stage.json with what it took; stage.json last, so that it marks a whole stage."""
+    wall, cpu = time.monotonic(), time.process_time()
+    counts = dict(compute(partial))
+    document = {
+        **about,
+        "config": plain(config),
+        "inputs": dict(inputs),
+        "seconds": round(time.monotonic() - wall, 3),
+        "cpu_seconds": round(time.process_time() - cpu, 3),
+        "counts": counts,
+    }
+    with open(partial / "stage.json", "w") as out:
+        json.dump(document, out, indent=1)
+        out.flush()
+        os.fsync(out.fileno())
+    return counts
+
+
+def _finished(folder: Path, key: str) -> Done | None:
+    try:
+        document = json.loads((folder / "stage.json").read_text())
+    except FileNotFoundError:
+        return None
+    except (json.JSONDecodeError, UnicodeDecodeError) as wrong:
+        raise BadInput(f"{folder}/stage.json is damaged ({wrong}); remove that folder and run again") from wrong
+    if document.get("key") != key:
+        raise BadInput(f"{folder} belongs to another key ({document.get('key')}); remove that folder and run again")
+    return Done(folder, key, document.get("counts", {}), reused=True)
+
+
+@contextmanager
+def _locked(path: Path) -> Iterator[None]:
+    """Held by one process at a time; the system lets go of it however the holder ends."""
+    while True:
+        with open(path, "w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            if not _is_still(path, lock.fileno()):  # its last holder removed it while this one waited
+                continue
+            try:
+                yield
+            finally:
+                path.unlink(missing_ok=True)
+            return
+
+
+def _is_still(path: Path, descriptor: int) -> bool:
+    try:
+        return os.stat(path).st_ino == os.fstat(descriptor).st_ino
+    except FileNotFoundError:
+        return False
+
+
+@contextmanager
+def _spoken(results: Path) -> Iterator[None]:
+    """A full disk in one clear message."""
+    try:
+        yield
+    except WriteFailed as refused:
+        cause = refused.__cause__
+        if isinstance(cause, OSError) and cause.errno in NO_SPACE:
+            raise WriteFailed(_full(results)) from refused
+        raise
+    except OSError as refused:
+        if refused.errno in NO_SPACE:
+            raise WriteFailed(_full(results)) from refused
+        raise
+
+
+def _full(results: Path) -> str:
+    return (
+        f"the disk that holds {results} is full. Every finished stage is kept; free some space "
+        "(or choose another place with --out DIR) and run the same command again: it goes on from there"
+    )

@@ -1,0 +1,131 @@
+"""table.json and table.md: every number with its unit, how many it is from, what was aligned, and its stages."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from processing.score import TossScore, VariantScore
+from processing.variants import TABLE
+from recordings.results import Results, VariantRecord
+from recordings.session_writer import write_bytes, write_json
+from recordings.tracks import ObjectTrack
+
+TABLE_FORMAT = 1
+COLUMNS = (
+    ("adds_auc", "ADD-S %"),
+    ("add_auc", "ADD %"),
+    ("success_5deg_5cm", "SR %"),
+    ("cd", "CD cm"),
+    ("cd_icp", "CD icp cm"),
+    ("median_rotation", "median deg"),
+    ("median_translation", "median mm"),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Row:
+    """One variant with its scores, or without them where there is no truth."""
+
+    record: VariantRecord
+    tracks: dict[int, ObjectTrack]
+    score: VariantScore | None
+
+
+def collect(results: Results, scores: dict[tuple[str, str], VariantScore]) -> list[Row]:
+    """Every variant of the results folder, in the order of the paper's table."""
+    order = {v.name: i for i, v in enumerate(TABLE)}
+    names = sorted(results.variants(), key=lambda v: (v[1], order.get(v[0], len(order)), v[0]))
+    return [Row(results.find(*v), results.tracks(*v), scores.get(v)) for v in names]
+
+
+def status_counts(track: ObjectTrack) -> dict[str, int]:
+    """Frames tracked, interpolated and lost."""
+    return {s: track.status.count(s) for s in ("tracked", "interpolated", "lost")}
+
+
+def table_document(results: Results, rows: Sequence[Row]) -> dict[str, Any]:
+    """table.json as plain values."""
+    return {"format_version": TABLE_FORMAT, "rows": [_row_document(results, row) for row in rows]}
+
+
+def _row_document(results: Results, row: Row) -> dict[str, Any]:
+    record, score = row.record, row.score
+    stages = sorted({s for t in record.tosses for s in (t.track, t.shape, t.masks) if s} | {record.shape or ""} - {""})
+    paper = next((v.paper for v in TABLE if v.name == record.name), None)
+    return {
+        "variant": record.name,
+        "scope": record.scope,
+        "label": record.label,
+        "session": record.session_name,
+        "tosses": [t.toss for t in record.tosses],
+        "values": {name: asdict(value) for name, value in (score.values if score else {}).items()},
+        "per_toss": [
+            {"toss": toss, **status_counts(track), **_toss_values(score, toss)} for toss, track in row.tracks.items()
+        ],
+        "warnings": list(score.warnings if score else ("no ground truth: nothing could be scored",)),
+        "notes": list(record.notes),
+        "stages": {s: results.stage(s).get("key", "") for s in stages},
+        "paper": None if paper is None else dict(zip(("adds_auc", "add_auc", "success_5deg_5cm", "cd"), paper)),
+    }
+
+
+def _toss_values(score: VariantScore | None, toss: int) -> dict[str, float]:
+    from processing.score import pose_values
+
+    found: list[TossScore] = [t for t in (score.tosses if score else ()) if t.toss == toss]
+    return {n: v.value for t in found for n, v in pose_values(t.errors, "own first frame").items()}
+
+
+def markdown(document: dict[str, Any]) -> str:
+    """table.md: one block per scope, the paper's figures (another data set) beside ours."""
+    rows = document["rows"]
+    lines = [f"# {rows[0]['session'] if rows else 'results'}", ""]
+    for scope in sorted({r["scope"] for r in rows}):
+        lines += [f"## scope {scope}", "", *_block([r for r in rows if r["scope"] == scope]), ""]
+    lines += [
+        "Poses are aligned per toss at its own first frame. CD icp: after a further rigid alignment of the mesh.",
+        "In brackets: the paper's figure for this row, on the paper's own data.",
+    ]
+    for row in rows:
+        lines += [f"- {row['variant']} ({row['scope']}): {w}" for w in (*row["warnings"], *row["notes"])]
+    return "\n".join(lines) + "\n"
+
+
+def _block(rows: Sequence[dict[str, Any]]) -> list[str]:
+    titles = ["variant", "tosses", "frames", "lost", *(title for _, title in COLUMNS)]
+    lines = ["| " + " | ".join(titles) + " |", "|---|" + "---:|" * (len(titles) - 1)]
+    for row in rows:
+        frames = sum(t["tracked"] + t["interpolated"] + t["lost"] for t in row["per_toss"])
+        lost = sum(t["lost"] for t in row["per_toss"])
+        cells = [row["variant"], str(len(row["tosses"])), str(frames), str(lost)]
+        lines.append("| " + " | ".join([*cells, *(_cell(row, name) for name, _ in COLUMNS)]) + " |")
+    return lines
+
+
+def _cell(row: dict[str, Any], name: str) -> str:
+    value = row["values"].get(name)
+    text = "-" if value is None else f"{value['value']:.3f}" if value["unit"] == "cm" else f"{value['value']:.2f}"
+    paper = (row["paper"] or {}).get(name)
+    return text if paper is None else f"{text} ({paper:g})"
+
+
+def write_table(results: Results, rows: Sequence[Row]) -> dict[str, Any]:
+    """Write table.json and table.md into the results folder; returns table.json's content."""
+    document = _finite(table_document(results, rows))
+    write_json(results.path / "table.json", document)
+    write_bytes(results.path / "table.md", markdown(document).encode())
+    return document
+
+
+def _finite(value: Any) -> Any:
+    """Strict JSON: an infinite error of a lost frame has no number."""
+    text = json.dumps(value)
+    return json.loads(text, parse_constant=lambda _: None)
+
+
+def table_path(results: Path) -> Path:
+    return results / "table.md"
