@@ -1,0 +1,1 @@
+"""Contact dynamics from poses: shape, friction and inertia of one tossed body on a plane (ContactNets)."""

@@ -1,0 +1,166 @@
+"""The parameter vector of a fit, and the optimisers: L-BFGS for a box, Adam with a cosine schedule for free points.
+
+Layout of a parameter vector: shape | square root of friction | inertia (6) | centre of mass (3, in SCALE_M).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from numpy import ndarray as Array
+from torch import Tensor
+
+from processing.contact.geometry import SCALE_M, Geometry
+from processing.contact.inertia import inertia_from
+from processing.contact.loss import Body, LossValue, StepData, Weights, contact_loss
+
+LOSS_SCALE = 1e4
+"""Brings the loss (J) to order one for the optimisers' tolerances."""
+
+
+@dataclass(frozen=True)
+class FitConfig:
+    learn_inertia: bool = False
+    """Inertia over mass, always physical."""
+    learn_center: bool = False
+    """The centre of mass against the prior's."""
+    friction_start: float = 0.03
+    lbfgs_iterations: int = 40
+    """For a box."""
+    adam_iterations: int = 160
+    """For free points, with a cosine schedule."""
+    adam_rate: float = 0.025
+    """In units of SCALE_M: the largest move of a coordinate in one iteration."""
+    device: str = "cpu"
+    """`cpu` or `cuda`; always in float64."""
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """A geometry, the inertia that the fit starts from (at the reference mass) and what of them is learned."""
+
+    geometry: Geometry
+    inertia_start_kgm2: Float[Array, "3 3"]
+    config: FitConfig
+
+    def start(self) -> Float[Array, " p"]:
+        shape = self.geometry.start()
+        return np.concatenate([shape, [self.config.friction_start**0.5], np.zeros(9)])
+
+    def learned(self) -> Bool[Array, " p"]:
+        count = len(self.geometry.start())
+        flags = [True] * (count + 1) + [self.config.learn_inertia] * 6 + [self.config.learn_center] * 3
+        return np.array(flags, dtype=bool)
+
+    def body(self, parameters: Float[Tensor, " p"]) -> Body:
+        inertia0 = torch.as_tensor(self.inertia_start_kgm2, dtype=parameters.dtype, device=parameters.device)
+        inertia = inertia_from(parameters[-9:-3], inertia0) if self.config.learn_inertia else inertia0
+        return Body(
+            self.geometry.points(parameters[:-10]), parameters[-10].square(), inertia, SCALE_M * parameters[-3:]
+        )
+
+    def numbers(self, parameters: Float[Array, " p"]) -> Body:
+        """The body of a parameter vector, without gradients, on the fit's device."""
+        with torch.no_grad():
+            return self.body(torch.as_tensor(parameters, dtype=torch.float64, device=self.config.device))
+
+    def loss(self, parameters: Float[Tensor, " p"], data: StepData, weights: Weights) -> LossValue:
+        idle = self.config.learn_inertia or self.config.learn_center
+        return contact_loss(data, self.body(parameters), self.geometry.contacts, weights, idle_gradient=idle)
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """Where an optimiser ended. `failures` counts unsolved inner problems over all evaluations, `last_failures` those
+    at the end (they take no part in the loss)."""
+
+    parameters: Float[Array, " p"]
+    loss: float
+    evaluations: int
+    failures: int
+    last_failures: int
+
+
+class _Objective:
+    """Loss and gradient over the learned entries of a parameter vector, counting as it goes."""
+
+    def __init__(self, model: Model, start: Float[Array, " p"], data: StepData, weights: Weights) -> None:
+        device = model.config.device
+        self.model, self.data, self.weights = model, data, weights
+        self.full = torch.as_tensor(start, dtype=torch.float64, device=device)
+        self.learned = torch.as_tensor(model.learned(), device=device)
+        self.free = self.full[self.learned].clone().requires_grad_(True)
+        self.evaluations = self.failures = self.last_failures = 0
+
+    def parameters(self) -> Float[Tensor, " p"]:
+        return self.full.masked_scatter(self.learned, self.free)
+
+    def __call__(self) -> Float[Tensor, ""]:
+        value = self.model.loss(self.parameters(), self.data, self.weights)
+        self.free.grad = None
+        scaled = value.loss * LOSS_SCALE
+        if scaled.requires_grad:
+            scaled.backward()
+        if self.free.grad is None:
+            self.free.grad = torch.zeros_like(self.free)
+        self.evaluations += 1
+        self.last_failures = int(value.impulses.failed.sum())
+        self.failures += self.last_failures
+        return scaled.detach()
+
+    def fit(self, loss: float) -> Fit:
+        ended = self.parameters().detach().cpu().numpy()
+        return Fit(ended, loss / LOSS_SCALE, self.evaluations, self.failures, self.last_failures)
+
+
+def fit_lbfgs(
+    model: Model, start: Float[Array, " p"], data: StepData, weights: Weights, iterations: int
+) -> Fit:
+    """Full-batch L-BFGS with a strong Wolfe line search."""
+    objective = _Objective(model, start, data, weights)
+    optimiser = torch.optim.LBFGS(
+        [objective.free],
+        max_iter=iterations,
+        history_size=20,
+        line_search_fn="strong_wolfe",
+        tolerance_grad=1e-5,
+        tolerance_change=1e-6,
+    )
+    optimiser.step(objective)
+    return objective.fit(float(objective()))
+
+
+def fit_adam(
+    model: Model,
+    start: Float[Array, " p"],
+    data: StepData,
+    weights: Weights,
+    iterations: int,
+    rate: float,
+    told: Callable[[int, float], None] | None = None,
+) -> Fit:
+    """Full-batch Adam with a cosine schedule: free points make the loss too kinked for L-BFGS."""
+    objective = _Objective(model, start, data, weights)
+    optimiser = torch.optim.Adam([objective.free], lr=rate)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, iterations)
+    loss = float("nan")
+    for i in range(iterations):
+        loss = float(objective())
+        optimiser.step()
+        schedule.step()
+        if told is not None:
+            told(i, loss / LOSS_SCALE)
+    return objective.fit(loss)
+
+
+def fit(model: Model, start: Float[Array, " p"], data: StepData, weights: Weights, share: float = 1.0) -> Fit:
+    """Fit with the optimiser of the geometry. `share` of the iterations is enough from a start near the optimum."""
+    config = model.config
+    if model.geometry.name == "box":
+        return fit_lbfgs(model, start, data, weights, max(4, round(config.lbfgs_iterations * share)))
+    iterations = max(8, round(config.adam_iterations * share))
+    return fit_adam(model, start, data, weights, iterations, config.adam_rate * (1.0 if share == 1.0 else 0.3))
