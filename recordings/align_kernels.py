@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any, no_type_check
 
+import numpy as np
 from numba import njit
 
 WIDEST_PX = 48.0
@@ -95,7 +96,7 @@ def draw(depth_m: Any, pixels: Any, z_m: Any, out: Any, limits: Any) -> None:
                 before = depth_m[i - 2, j] if i > 1 else 0.0
                 after = depth_m[i + 1, j] if i + 1 < height else 0.0
                 up = _joined(before, depth_m[i - 1, j], depth_m[i, j], after, relative, quadratic, most)
-            # every pixel is the right angle of the triangle to its right and below, and of the one to its left and above
+            # each pixel is the right angle of the triangle to its right and below, and of the one to its left and above
             if right and down:
                 _triangle(pixels, z_m, i, j, i, j + 1, i + 1, j, out)
             if left and up:
@@ -108,8 +109,10 @@ def draw(depth_m: Any, pixels: Any, z_m: Any, out: Any, limits: Any) -> None:
 @njit(cache=True, nogil=True)
 def _point(u: float, v: float, z: float, half: float, out: Any) -> None:
     rows, columns = out.shape
-    for y in range(max(0, int(round(v - half))), min(rows - 1, int(round(v + half))) + 1):
-        for x in range(max(0, int(round(u - half))), min(columns - 1, int(round(u + half))) + 1):
+    y_first, y_last = max(0, int(np.rint(v - half))), min(rows - 1, int(np.rint(v + half)))
+    x_first, x_last = max(0, int(np.rint(u - half))), min(columns - 1, int(np.rint(u + half)))
+    for y in range(y_first, y_last + 1):
+        for x in range(x_first, x_last + 1):
             if out[y, x] == 0.0 or z < out[y, x]:
                 out[y, x] = z
 

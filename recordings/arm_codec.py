@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from foxglove_schemas_protobuf.JointStates_pb2 import JointStates
 from google.protobuf.message import DecodeError
+from google.protobuf.timestamp_pb2 import Timestamp
 from jaxtyping import Float, Int64, UInt8
 from numpy import ndarray as Array
 
@@ -151,23 +152,8 @@ def _split_timestamp(data: bytes) -> tuple[int | None, bytes]:
     if len(data) < 2 or data[0] != 0x0A or data[1] > 22 or 2 + data[1] > len(data):
         return None, b""
     end = 2 + data[1]
-    read = _field_reader(data, end)
-    seconds, at = read(2, 0x08)
-    nanos, at = read(at, 0x10)
-    return (seconds * _NANOS + nanos, data[end:]) if at == end else (None, b"")
-
-
-def _field_reader(data: bytes, end: int) -> Callable[[int, int], tuple[int, int]]:
-    def read(at: int, tag: int) -> tuple[int, int]:
-        if at >= end or data[at] != tag:
-            return 0, at
-        value, shift, at = 0, 0, at + 1
-        while at < end:
-            value |= (data[at] & 0x7F) << shift
-            shift += 7
-            at += 1
-            if data[at - 1] < 0x80:
-                return (value - (1 << 64) if value >= 1 << 63 else value), at
-        return 0, -1
-
-    return read
+    try:
+        stamp = Timestamp.FromString(data[2:end])
+    except DecodeError:
+        return None, b""
+    return stamp.seconds * _NANOS + stamp.nanos, data[end:]

@@ -235,8 +235,9 @@ def _toss_lines(toss: TossLine) -> list[str]:
     parts += [f"{kind} at {time_s - start_s:.3f} s" for kind, time_s in toss.events]
     parts += [f"verdict {toss.verdict}"] if toss.verdict else []
     parts += [toss.note] if toss.note else []
-    width = max((len(s.topic) for s in toss.streams), default=0)
-    return ["  ".join(parts), *(_stream_line(s, width) for s in toss.streams)]
+    shown = [s for s in toss.streams if s.topic not in ONCE and not s.topic.endswith("calibration")]
+    width = max((len(s.topic) for s in shown), default=0)
+    return ["  ".join(parts), *(_stream_line(s, width) for s in shown)]
 
 
 def _stream_line(s: StreamLine, width: int) -> str:

@@ -225,7 +225,11 @@ class _Content:
             return None
         expected_m = _plane_depth(lens, world_from_lens.rotation[2], float(world_from_lens.translation_m[2]))
         near = (expected_m > 0) & (expected_m < 2.0)
-        quotients = [(d.raw[::4, ::4] * d.unit_m / expected_m)[near & (d.raw[::4, ::4] > 0)] for d in images]
+        quotients = []
+        for image in images:
+            raw = image.raw[::4, ::4]
+            seen = near & (raw > 0)
+            quotients.append(raw[seen] * image.unit_m / expected_m[seen])
         joined = np.concatenate(quotients)
         return Plausibility(float(np.median(joined)), len(joined)) if len(joined) > 500 else None
 

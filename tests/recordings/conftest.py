@@ -133,7 +133,7 @@ def small_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def full_disk(tmp_path: Path) -> Iterator[Callable[[int], None]]:
-    """`full_disk(n)`: no file of this process may grow beyond n bytes (RLIMIT_FSIZE): the disk refuses, as when full."""
+    """`full_disk(n)`: no file of this process may grow beyond n bytes (RLIMIT_FSIZE), as when the disk is full."""
     import resource
     import signal
 
