@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from importlib import import_module
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+from recordings.cli_inspect import add_commands
 from recordings.console import Outcome, Parser, add_command, command_parser, progress_for, run_command
 
 EXPORTS = {
@@ -40,8 +39,7 @@ def _parser() -> Parser:
         "toss-session export tum sessions/cube tracks",
     )
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    if find_spec("recordings.cli_inspect"):  # being written
-        import_module("recordings.cli_inspect").add_commands(commands)
+    add_commands(commands)
     _add_imports(commands)
     _add_exports(commands)
     return parser
@@ -55,21 +53,77 @@ def _add_imports(commands: Any) -> None:
         "toss-session import folder recordings/cube_dev sessions/cube",
     )
     layouts = group.add_subparsers(title="layouts", metavar="LAYOUT", required=True)
-    folder = add_command(
+    for add in (_add_folder, _add_bundlesdf, _add_contactnets, _add_realsense, _add_rosbag):
+        add(layouts)
+
+
+def _add_folder(layouts: Any) -> None:
+    parser = add_command(
         layouts,
         "folder",
         "Read the folder layout: session.json, toss_XX/{rgb,depth,timestamps.txt,mask_first.png}, mono/, calibration/.",
         "toss-session import folder recordings/cube_dev sessions/cube",
         "toss-session import folder recordings/cube_dev sessions/cube --truth recordings/cube_dev_truth",
     )
-    folder.add_argument(
-        "dir", metavar="DIR", type=Path, help="a folder with session.json and toss_00/rgb, toss_00/depth"
+    parser.add_argument("dir", metavar="DIR", type=Path, help="a folder with session.json and toss_00/{rgb,depth}")
+    _add_out(parser)
+    parser.add_argument("--truth", metavar="TRUTH_DIR", type=Path, help="a *_truth folder, read into truth/")
+    parser.set_defaults(work=_import_folder)
+
+
+def _add_bundlesdf(layouts: Any) -> None:
+    parser = add_command(
+        layouts,
+        "bundlesdf",
+        "Read folders of BundleSDF, FoundationPose or YCBInEOAT: rgb, depth (uint16 mm), masks, cam_K.txt.",
+        "toss-session import bundlesdf recordings/milk_00 recordings/milk_01 sessions/milk --fps 30",
     )
-    _add_out(folder)
-    folder.add_argument(
-        "--truth", metavar="TRUTH_DIR", type=Path, help="a *_truth folder, read into the session's truth/"
+    parser.add_argument("dirs", metavar="DIR", type=Path, nargs="+", help="one folder per toss")
+    _add_out(parser)
+    parser.add_argument("--fps", type=float, default=30.0, help="frames per second that times are made from (30)")
+    parser.set_defaults(work=_import_bundlesdf)
+
+
+def _add_contactnets(layouts: Any) -> None:
+    parser = add_command(
+        layouts,
+        "contactnets",
+        "Read toss files of ContactNets or dair_pll: poses only, for contact learning alone.",
+        "toss-session import contactnets recordings/contactnets sessions/tosses",
+        "toss-session import contactnets recordings/tosses sessions/tosses --scale 0.0524 --dt 0.006756757",
     )
-    folder.set_defaults(work=_import_folder)
+    parser.add_argument("path", metavar="PATH", type=Path, help="a folder of .pt files, one file, or their parent")
+    _add_out(parser)
+    parser.add_argument("--scale", metavar="M", type=float, help="metres per unit of position (else params_processed)")
+    parser.add_argument("--dt", metavar="S", type=float, help="seconds per step (else params_processed)")
+    parser.set_defaults(work=_import_contactnets)
+
+
+def _add_realsense(layouts: Any) -> None:
+    parser = add_command(
+        layouts,
+        "realsense",
+        "Read RealSense recordings, .bag or .db3: colour and depth with their own stamps, not aligned.",
+        "toss-session import realsense recordings/take_00.db3 recordings/take_01.db3 sessions/milk",
+    )
+    parser.add_argument("files", metavar="FILE", type=Path, nargs="+", help="one recording per toss")
+    _add_out(parser)
+    parser.set_defaults(work=_import_realsense)
+
+
+def _add_rosbag(layouts: Any) -> None:
+    parser = add_command(
+        layouts,
+        "rosbag",
+        "Read ROS 1 or ROS 2 bags (.bag, folder, .mcap, .db3) of the usual image topics.",
+        "toss-session import rosbag recordings/take_00.bag sessions/milk",
+        "toss-session import rosbag recordings/take_00 sessions/milk --color /camera/color/image_raw",
+    )
+    parser.add_argument("bags", metavar="BAG", type=Path, nargs="+", help="one bag per toss")
+    _add_out(parser)
+    parser.add_argument("--color", metavar="TOPIC", help="the colour images, where a bag has several")
+    parser.add_argument("--depth", metavar="TOPIC", help="the depth images, where a bag has several")
+    parser.set_defaults(work=_import_rosbag)
 
 
 def _add_out(parser: argparse.ArgumentParser) -> None:
@@ -80,6 +134,30 @@ def _import_folder(args: argparse.Namespace) -> Outcome:
     from recordings.importers.folder import import_folder
 
     return _said(import_folder(args.dir, args.out, args.truth, progress_for("import")))
+
+
+def _import_bundlesdf(args: argparse.Namespace) -> Outcome:
+    from recordings.importers.bundlesdf import import_bundlesdf
+
+    return _said(import_bundlesdf(args.dirs, args.out, args.fps, progress_for("import")))
+
+
+def _import_contactnets(args: argparse.Namespace) -> Outcome:
+    from recordings.importers.contactnets import import_contactnets
+
+    return _said(import_contactnets(args.path, args.out, args.scale, args.dt, progress_for("import")))
+
+
+def _import_realsense(args: argparse.Namespace) -> Outcome:
+    from recordings.importers.realsense import import_realsense
+
+    return _said(import_realsense(args.files, args.out, progress_for("import")))
+
+
+def _import_rosbag(args: argparse.Namespace) -> Outcome:
+    from recordings.importers.rosbag import import_rosbag
+
+    return _said(import_rosbag(args.bags, args.out, args.color, args.depth, progress_for("import")))
 
 
 def _said(report: Any) -> Outcome:
