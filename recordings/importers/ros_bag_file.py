@@ -36,7 +36,9 @@ class Bag:
             self._reader: Any = Reader1(path) if self._is_ros1 else Reader2(path)
             self._reader.open()
         except Exception as wrong:  # rosbags raises its own, the decompressors', yaml's and sqlite's errors
-            raise BadInput(f"{path} cannot be read as a bag of ROS 1, or of ROS 2 in cdr: {_one_line(wrong)}") from wrong
+            raise BadInput(
+                f"{path} cannot be read as a bag of ROS 1, or of ROS 2 in cdr: {_one_line(wrong)}"
+            ) from wrong
         self.types = {c.topic: c.msgtype for c in self._reader.connections}
         self._refuse_other_encodings()
 

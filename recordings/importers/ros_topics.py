@@ -61,12 +61,13 @@ def choose(bag: Bag, color: str | None, depth: str | None) -> Topics:
 def _kind(bag: Bag, topic: str) -> str:
     """`color`, `depth`, `grey`, or the encoding that is none of them."""
     message = bag.first(topic)
+    if message is None:
+        return "nothing"
     if not is_compressed(message):
         if message.encoding in DEPTH_ENCODINGS:
             return "depth"
-        return {1: "grey"}.get(
-            CHANNELS.get(message.encoding, 0), "color" if message.encoding in CHANNELS else message.encoding
-        )
+        channels = CHANNELS.get(message.encoding)
+        return str(message.encoding) if channels is None else ("grey" if channels == 1 else "color")
     if "compressedDepth" in message.format:
         return "depth"
     header = read_header(bytes(message.data), f"{bag.path.name}: the first image of {topic}")
