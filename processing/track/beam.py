@@ -25,6 +25,8 @@ Schedule = tuple[tuple[float, float, float, float, float, float], ...]
 0.8 m), share of the samples."""
 
 USUAL_DISTANCE_M = 0.8
+LEAST_DELAY_S = 0.0003
+"""Between colour and depth: less is no motion."""
 
 
 @dataclass(frozen=True)
@@ -51,6 +53,11 @@ class BeamConfig:
     """Worse than the best by more than this: dropped."""
     grid_deg: tuple[float, ...] = (20.0, 40.0, 65.0)
     grid_axes: int = 20
+    hold: float = 20.0
+    """The pull towards the foretold pose weighs as much as so many independent samples ..."""
+    hold_deg: float = 2.0
+    hold_m: float = 0.01
+    """... of this standard deviation."""
     motion: MotionConfig = field(default_factory=MotionConfig)
     keyframes: KeyframeConfig = field(default_factory=KeyframeConfig)
     ransac: RansacConfig = field(default_factory=RansacConfig)
@@ -137,6 +144,7 @@ def follow(
         if not scene.store.usable(i):
             beam = [_without(h, i) for h in beam]
             continue
+        _put_at_color_time(scene, beam[0], i)
         grown: list[Hypothesis] = []
         for h in beam:
             kept, others = _branches(scene, h, i, config)
@@ -147,6 +155,20 @@ def follow(
             on_step(i, beam)
     margin = beam[1].total - beam[0].total if len(beam) > 1 else np.inf
     return Followed(beam[0], float(margin), rejected)
+
+
+def _put_at_color_time(scene: Scene, h: Hypothesis, i: int) -> None:
+    """Where depth is exposed at another time than colour: make the view with the motion that the last poses foretell."""
+    crop, tracked = scene.store.crops[i], [j for j in h.tracked if j != i]
+    if crop is None or abs(crop.depth_delay_s) < LEAST_DELAY_S or len(tracked) < 2 or np.isfinite(h.poses[i, 0, 0]):
+        return
+    a, b = tracked[-2], tracked[-1]
+    step_s = scene.times_s[b] - scene.times_s[a]
+    color, depth = (
+        moved(h.poses[a], h.poses[b], step_s, t - scene.times_s[b], scene.center_m, scene.gravity_camera_m_s2)
+        for t in (scene.times_s[i], scene.times_s[i] + crop.depth_delay_s)
+    )
+    scene.store.fill(i, color @ k.inverse(depth))
 
 
 def started(store: ViewStore, count: int, view: int, pose: Float[Array, "4 4"]) -> Hypothesis:
@@ -169,7 +191,7 @@ def _extended(h: Hypothesis, i: int, c: Candidate, scene: Scene, config: BeamCon
     poses, costs, on = h.poses.copy(), h.costs.copy(), h.on_surface.copy()
     poses[i], costs[i], on[i] = c.pose, c.fit, c.on_surface
     keys = h.keyframes
-    if is_new(poses, i, keys, scene.center_m, config.keyframes):
+    if i not in keys and is_new(poses, i, keys, scene.center_m, config.keyframes):
         keys = (*keys, i)
     return Hypothesis(poses, costs, on, (*h.done, i), keys, h.total + c.cost)
 
@@ -197,7 +219,7 @@ def _differ(a: Hypothesis, b: Hypothesis, i: int, config: BeamConfig) -> bool:
 def _branches(scene: Scene, h: Hypothesis, i: int, config: BeamConfig) -> tuple[list[Candidate], list[Candidate]]:
     """Candidates of one hypothesis for frame i: those that may live on, best first, and the others."""
     starts = _usual_starts(scene, h, i)
-    found = _aligned_all(scene, h, i, starts, config)
+    found = _merged(_aligned_all(scene, h, i, starts, config) + _held(scene, h, i, starts, config), config)
     if not found or found[0].fit > config.doubt:
         found = _merged(found + _aligned_all(scene, h, i, _feature_starts(scene, h, i, config), config), config)
     if not found or found[0].fit > config.search:
@@ -217,13 +239,15 @@ def _usual_starts(scene: Scene, h: Hypothesis, i: int) -> list[tuple[str, Float[
     shifted = last.copy()
     shifted[:3, 3] += shift
     starts = [("shift", shifted)]
+    if np.isfinite(h.poses[i, 0, 0]):
+        starts = [("as before", h.poses[i]), *starts]
     if len(tracked) > 1:
         a, b = tracked[-2], tracked[-1]
         step_s, next_s = scene.times_s[b] - scene.times_s[a], scene.times_s[i] - scene.times_s[b]
         prior = moved(h.poses[a], last, step_s, next_s, scene.center_m, scene.gravity_camera_m_s2)
         on_cloud = prior.copy()
         on_cloud[:3, 3] = last[:3, 3] + shift
-        starts = [("prior", prior), ("prior on cloud", on_cloud), *starts]
+        starts = [*starts, ("prior", prior), ("prior on cloud", on_cloud)]
     return starts
 
 
@@ -231,7 +255,7 @@ def _feature_starts(scene: Scene, h: Hypothesis, i: int, config: BeamConfig) -> 
     """Poses that feature matches to the last view and to the keyframes say."""
     here = scene.described(i)
     starts = []
-    for j in dict.fromkeys((h.tracked[-1], *reversed(h.keyframes[-8:]))):
+    for j in dict.fromkeys((h.tracked[-1], *(j for j in reversed(h.keyframes[-8:]) if j != i))):
         for motion in relative_motions(scene.matcher, scene.described(j), here, config.ransac, seed=i, most=2):
             starts.append((f"features of {j}", motion.other_from_one @ h.poses[j]))
     return starts[:8]
@@ -276,6 +300,20 @@ def _refined(scene: Scene, h: Hypothesis, i: int, rough: list[Candidate], config
     return _merged([c for c in fine if c is not None], config)
 
 
+def _held(
+    scene: Scene, h: Hypothesis, i: int, starts: list[tuple[str, Float[Array, "4 4"]]], config: BeamConfig
+) -> list[Candidate]:
+    """The foretold motion, moved only where the images insist: what looks the same from all sides must not turn with
+    its shading."""
+    found = []
+    for name, pose in starts:
+        if name == "prior":
+            coarse = _aligned(scene, h, i, pose, config.coarse, config, name, held=pose)
+            if coarse is not None:
+                found.append(_aligned(scene, h, i, coarse.pose, config.fine, config, "held", held=pose))
+    return [c for c in found if c is not None]
+
+
 def _merged(candidates: list[Candidate], config: BeamConfig) -> list[Candidate]:
     """Sorted by cost, without those that say the same as a better one."""
     kept: list[Candidate] = []
@@ -286,21 +324,31 @@ def _merged(candidates: list[Candidate], config: BeamConfig) -> list[Candidate]:
 
 
 def _aligned(
-    scene: Scene, h: Hypothesis, i: int, pose: Float[Array, "4 4"], schedule: Schedule, config: BeamConfig, source: str
-) -> Candidate | None:
-    """One candidate aligned to the nearest views of the model; None where nothing faces it."""
-    refs = references(h.poses, h.keyframes, h.tracked[-1], pose, scene.center_m, config.keyframes)
+    scene: Scene, h: Hypothesis, i: int, pose: Float[Array, "4 4"], schedule: Schedule, config: BeamConfig, source: str,
+    held: Float[Array, "4 4"] | None = None,
+) -> Candidate | None:  # fmt: skip
+    """One candidate aligned to the nearest views of the model, held to the pose that the motion foretells where it is
+    given; None where nothing faces it."""
+    refs = references(
+        h.poses, tuple(j for j in h.keyframes if j != i), h.tracked[-1], pose, scene.center_m, config.keyframes
+    )
     if len(refs) == 0:
         return None
     store = scene.store
     distance = float(np.linalg.norm(store.center_m[i]))
     aligned, _, fit, on, _ = k.align_view(
         np.ascontiguousarray(pose), i, refs, np.ascontiguousarray(h.poses[refs]), store.maps, store.samples, store.table,
-        store.optics.focal, store.optics.center, rows(schedule, distance), np.zeros(6), np.eye(4),
+        store.optics.focal, store.optics.center, rows(schedule, distance), np.zeros(6) if held is None else _hold(config), np.eye(4) if held is None else held,
     )  # fmt: skip
     if not np.isfinite(aligned).all():
         return None
     return Candidate(aligned, float(fit), _price(scene, h, i, aligned, config), float(on), source)
+
+
+def _hold(config: BeamConfig) -> Float[Array, "6"]:
+    """Information of the pull towards the foretold pose (translation, rotation)."""
+    turn = config.hold / np.radians(config.hold_deg) ** 2
+    return np.array([config.hold / config.hold_m**2] * 3 + [turn] * 3)
 
 
 def _price(scene: Scene, h: Hypothesis, i: int, pose: Float[Array, "4 4"], config: BeamConfig) -> float:
@@ -314,5 +362,3 @@ def _price(scene: Scene, h: Hypothesis, i: int, pose: Float[Array, "4 4"], confi
     three = (h.poses[a], h.poses[b], pose)
     steps = (times[b] - times[a], times[i] - times[b])
     return change_cost(three, steps, scene.center_m, scene.gravity_camera_m_s2, config.motion)
-
-

@@ -93,7 +93,7 @@ def _tight(crop: Crop, rim: int = 4) -> tuple[Float[Array, "2"], Array, Array]:
     rows, columns = np.flatnonzero(crop.mask.any(1)), np.flatnonzero(crop.mask.any(0))
     top, left = max(rows[0] - rim, 0), max(columns[0] - rim, 0)
     area = np.s_[top : rows[-1] + rim + 1, left : columns[-1] + rim + 1]
-    gray = crop.gray[area]
+    gray = crop.color[area] @ np.array([0.299, 0.587, 0.114], dtype=np.float32)
     low, high = np.quantile(gray[crop.mask[area]], [0.02, 0.98])
     stretched = np.clip((gray - low) / max(high - low, 0.05), 0, 1) * 255
     grown = cv2.dilate(crop.mask[area].astype(np.uint8), np.ones((3, 3), np.uint8))

@@ -13,22 +13,28 @@ from typing import no_type_check
 import numpy as np
 from numba import njit
 
-Z, NX, NY, NZ, OUTSIDE, SHARP, SMOOTH = range(7)
-CHANNELS = 7
+Z, NX, NY, NZ, OUTSIDE = range(5)
+LOOKS = 3
+"""Brightness levelled against shading, and two differences of colour that shading leaves alone."""
+SHARP, SMOOTH, CHANNELS = 5, 5 + LOOKS, 5 + 2 * LOOKS
+"""First channel of the sharp looks and of the smooth ones; channels in all."""
 HIDDEN = -1.0
 """OUTSIDE holds the distance to the mask in pixels (0 inside), or HIDDEN where something nearer may cover the object."""
 
 OFFSET, U0, V0, WIDTH, HEIGHT, FIRST, COUNT = range(7)
 """Columns of the view table: first pixel, crop corner and size, first sample and number of samples."""
 
-PX, PY, PZ, SNX, SNY, SNZ, SSHARP, SSMOOTH = range(8)
-"""Columns of a sample: point and normal in its camera's frame (m), and its two intensities."""
+PX, PY, PZ, SNX, SNY, SNZ, SSHARP = range(7)
+SAMPLE = 6 + 2 * LOOKS
+"""Columns of a sample: point and normal in its camera's frame (m), then its looks: LOOKS sharp, LOOKS smooth."""
 
 LEVEL, STEPS, GEOMETRY_M, INTENSITY, OUTLINE_M, SHARE = range(6)
 """Columns of a schedule row: intensity channel (0 sharp, 1 smooth), steps, the three scales, share of the samples."""
 
-NEUTRAL_COST = 0.3
-"""Of a point that the other view cannot judge: what a well fitting point costs on a bad day."""
+COVERED_COST = 0.12
+"""Of a point that faces the other view but lies behind what is seen there: it may be covered."""
+ODD_COST = 0.4
+"""Of a point beside a surface that faces elsewhere, or in front of a hole."""
 
 
 @no_type_check
@@ -152,7 +158,7 @@ def pair_terms(samples, step, pose, maps, row, focal, center, level, s_geo, s_in
         near = off + iv * w + iu
         out = maps[near, OUTSIDE]
         if out < 0.0:
-            cost += NEUTRAL_COST
+            seen -= 1
             continue
         if out > 0.0:
             gap = out * z / fx
@@ -167,12 +173,18 @@ def pair_terms(samples, step, pose, maps, row, focal, center, level, s_geo, s_in
                 J[2] = -(du * x + dv * fy / fx * y) * iz
                 _add(J, x, y, z, gap, k, H, g)
             continue
+        mx = pose[0, 0] * p[SNX] + pose[0, 1] * p[SNY] + pose[0, 2] * p[SNZ]
+        my = pose[1, 0] * p[SNX] + pose[1, 1] * p[SNY] + pose[1, 2] * p[SNZ]
+        mz = pose[2, 0] * p[SNX] + pose[2, 1] * p[SNY] + pose[2, 2] * p[SNZ]
+        if (mx * x + my * y + mz * z) * iz > -0.1:  # faces away from the other camera: cannot be compared
+            seen -= 1
+            continue
         zr = maps[near, Z]
         nx, ny, nz = maps[near, NX], maps[near, NY], maps[near, NZ]
         fits = False
         facing = 0.0
         if zr <= 0.0:
-            cost += 0.5 * NEUTRAL_COST
+            cost += 0.5 * COVERED_COST
             fits = True
         else:
             ju, jv = int(np.floor(u)), int(np.floor(v))
@@ -190,11 +202,7 @@ def pair_terms(samples, step, pose, maps, row, focal, center, level, s_geo, s_in
                 if abs(bottom) > 0.05:
                     zr = zr * top / bottom
             ahead = zr - z  # positive: the point lies in front of what this view sees
-            facing = (
-                nx * (pose[0, 0] * p[SNX] + pose[0, 1] * p[SNY] + pose[0, 2] * p[SNZ])
-                + ny * (pose[1, 0] * p[SNX] + pose[1, 1] * p[SNY] + pose[1, 2] * p[SNZ])
-                + nz * (pose[2, 0] * p[SNX] + pose[2, 1] * p[SNY] + pose[2, 2] * p[SNZ])
-            )
+            facing = nx * mx + ny * my + nz * mz
             r_m = (nx * x + ny * y + nz * z) * (1.0 - zr * iz)
             r = r_m / s_geo
             if abs(r) < 3.0 and facing > 0.5:
@@ -208,24 +216,25 @@ def pair_terms(samples, step, pose, maps, row, focal, center, level, s_geo, s_in
                 cost += min(0.5 + ahead / (12.0 * s_geo), 1.0)
                 against += 1
             else:
-                cost += NEUTRAL_COST if ahead < -3.0 * s_geo else 0.5
+                cost += COVERED_COST if ahead < -3.0 * s_geo else ODD_COST
         if fits:
             ju, jv = int(np.floor(u)), int(np.floor(v))
             a, b = u - ju, v - jv
             q = off + jv * w + ju
-            ch = SHARP + level
-            i00, i10, i01, i11 = maps[q, ch], maps[q + 1, ch], maps[q + w, ch], maps[q + w + 1, ch]
-            top, bottom = i00 * (1 - a) + i10 * a, i01 * (1 - a) + i11 * a
-            e = top * (1 - b) + bottom * b - p[SSHARP + level]
-            r = e / s_int
-            cost += 0.5 * min(r * r / 9.0, 1.0)
-            if abs(r) < 3.0:
-                k = 1.0 - r * r / 9.0
-                gu = ((i10 - i00) * (1 - b) + (i11 - i01) * b) * fx * iz
-                gv = (bottom - top) * fy * iz
-                J[0], J[1] = gu, gv
-                J[2] = -(gu * x + gv * y) * iz
-                _add(J, x, y, z, e, wi * k * k, H, g)
+            for c in range(LOOKS):
+                ch = SHARP + level * LOOKS + c
+                i00, i10, i01, i11 = maps[q, ch], maps[q + 1, ch], maps[q + w, ch], maps[q + w + 1, ch]
+                top, bottom = i00 * (1 - a) + i10 * a, i01 * (1 - a) + i11 * a
+                e = top * (1 - b) + bottom * b - p[SSHARP + level * LOOKS + c]
+                r = e / s_int
+                cost += 0.5 / LOOKS * min(r * r / 9.0, 1.0)
+                if abs(r) < 3.0:
+                    k = 1.0 - r * r / 9.0
+                    gu = ((i10 - i00) * (1 - b) + (i11 - i01) * b) * fx * iz
+                    gv = (bottom - top) * fy * iz
+                    J[0], J[1] = gu, gv
+                    J[2] = -(gu * x + gv * y) * iz
+                    _add(J, x, y, z, e, wi * k * k, H, g)
     return cost, seen, on, against
 
 

@@ -1,4 +1,4 @@
-"""What one frame shows of the object, made ready for alignment: smooth depth, normals, two grey levels, outline, samples.
+"""What one frame shows of the object, made ready for alignment: smooth depth, normals, looks, outline, samples.
 
 All views of a toss lie in flat arrays (see kernels.py), so that any view can serve as the model for any other: the
 growing model is the set of views at their poses. Nothing is averaged away, nothing limits the object's size, and a
@@ -31,8 +31,10 @@ class ViewConfig:
     """Depth off a plane by more than this share of the distance belongs to another surface."""
     smooth_px: float = 2.5
     """Blur of the smooth grey level, which widens the basin of attraction."""
-    shade_px: float = 9.0
+    shade_px: float = 5.0
     """Scale over which brightness is levelled: shading and exposure are no texture."""
+    color_gain: float = 1.5
+    """Of colour differences against brightness."""
     samples: int = 500
     """Surface points of a view that alignment uses."""
     least_samples: int = 40
@@ -84,8 +86,8 @@ class Crop:
     """u, v of the crop's first pixel."""
     mask: Bool[Array, "h w"]
     depth_m: Float32[Array, "h w"]
-    gray: Float32[Array, "h w"]
-    """Brightness 0..1 at the session's usual exposure."""
+    color: Float32[Array, "h w 3"]
+    """RGB 0..1 at the session's usual exposure."""
     covered: Bool[Array, "h w"]
     """Pixels outside the mask where something nearer may hide the object."""
     height_m: Float32[Array, "h w"] | None
@@ -111,14 +113,13 @@ def cut(
     top, bottom = max(rows[0] - config.margin_px, 0), min(rows[-1] + config.margin_px + 1, h)
     left, right = max(columns[0] - config.margin_px, 0), min(columns[-1] + config.margin_px + 1, w)
     area = np.s_[top:bottom, left:right]
-    gray = cv2.cvtColor(frame.color_rgb, cv2.COLOR_RGB2GRAY)
-    gray = optics.straight(gray, smooth=True)[area].astype(np.float32) / np.float32(255.0 * gain)
+    color = optics.straight(frame.color_rgb, smooth=True)[area].astype(np.float32) / np.float32(255.0 * gain)
     depth_m = np.ascontiguousarray(optics.straight(frame.depth_m, smooth=False)[area])
     inside = np.ascontiguousarray(straight_mask[area])
     height_m = _heights(depth_m, (left, top), optics, camera_from_world)
     covered = _covered(depth_m, inside, height_m, config)
     delay_s = (frame.depth_time_ns - frame.time_ns) * 1e-9
-    return Crop(position, (int(left), int(top)), inside, depth_m, gray, covered, height_m, delay_s)
+    return Crop(position, (int(left), int(top)), inside, depth_m, color, covered, height_m, delay_s)
 
 
 def _heights(
@@ -159,12 +160,12 @@ def _covered(
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """One view: `pixels` (h, w, CHANNELS) and `samples` (n, 8) as kernels.py has them."""
+    """One view: `pixels` (h, w, CHANNELS) and `samples` (n, SAMPLE) as kernels.py has them."""
 
     position: int
     corner: tuple[int, int]
-    pixels: Float32[Array, "h w 7"]
-    samples: Float32[Array, "n 8"]
+    pixels: Float32[Array, "h w c"]
+    samples: Float32[Array, "n s"]
 
     @property
     def center_m(self) -> Float[Array, "3"]:
@@ -173,7 +174,7 @@ class View:
 
 
 def make_view(crop: Crop, optics: Optics, config: ViewConfig, motion: Float[Array, "4 4"] | None = None) -> View | None:
-    """Depth made smooth, normals, levelled grey, distance to the outline, samples.
+    """Depth made smooth, normals, levelled looks, distance to the outline, samples.
 
     `motion` (4x4, camera frame) moves the object from its place at depth's exposure to that at colour's; None: at rest.
     None is returned where too few points are left.
@@ -188,7 +189,7 @@ def make_view(crop: Crop, optics: Optics, config: ViewConfig, motion: Float[Arra
     pixels[..., k.Z], pixels[..., k.NX : k.NZ + 1] = smooth_m, normals
     outside = cv2.distanceTransform((~crop.mask).astype(np.uint8), cv2.DIST_L2, 5)
     pixels[..., k.OUTSIDE] = np.where(crop.covered, k.HIDDEN, outside)
-    pixels[..., k.SHARP], pixels[..., k.SMOOTH] = _levels(crop.gray, crop.mask, config)
+    pixels[..., k.SHARP :] = _looks(crop.color, crop.mask, config)
     samples = _samples(pixels, rays, config, crop.position)
     return View(crop.position, crop.corner, pixels, samples) if len(samples) >= config.least_samples else None
 
@@ -239,16 +240,21 @@ def _moved_depth(crop: Crop, optics: Optics, motion: Float[Array, "4 4"], config
     return np.where(np.isfinite(out) & crop.mask, out, np.float32(0))
 
 
-def _levels(
-    gray: Float32[Array, "h w"], mask: Bool[Array, "h w"], config: ViewConfig
-) -> tuple[Float32[Array, "h w"], Float32[Array, "h w"]]:
-    """Sharp and smooth grey, both levelled: divided by the brightness around (within the mask)."""
+def _looks(color: Float32[Array, "h w 3"], mask: Bool[Array, "h w"], config: ViewConfig) -> Float32[Array, "h w 6"]:
+    """Brightness divided by that around it (shading and shadows stay with the room, not with the object), and two
+    differences of colour, each sharp and smooth."""
     weight = mask.astype(np.float32)
-    around = _masked_blur(gray, weight, config.shade_px)
-    level = gray / (around + 0.03) - 1.0
-    smooth = _masked_blur(level, weight, config.smooth_px)
-    sharp = np.where(mask, level, smooth)
-    return sharp.astype(np.float32), smooth
+    red, green, blue = color[..., 0], color[..., 1], color[..., 2]
+    gray = 0.299 * red + 0.587 * green + 0.114 * blue
+    total = red + green + blue + 0.1
+    looks = (
+        gray / (_masked_blur(gray, weight, config.shade_px) + 0.03) - 1.0,
+        config.color_gain * (red - green) / total,
+        config.color_gain * (blue - 0.5 * (red + green)) / total,
+    )
+    smooth = [_masked_blur(look, weight, config.smooth_px) for look in looks]
+    sharp = [np.where(mask, look, blurred) for look, blurred in zip(looks, smooth)]
+    return np.stack([*sharp, *smooth], -1).astype(np.float32)
 
 
 def _masked_blur(image: Float32[Array, "h w"], weight: Float32[Array, "h w"], sigma_px: float) -> Float32[Array, "h w"]:
@@ -257,15 +263,15 @@ def _masked_blur(image: Float32[Array, "h w"], weight: Float32[Array, "h w"], si
 
 
 def _samples(
-    pixels: Float32[Array, "h w 7"], rays: Float[Array, "4"], config: ViewConfig, seed: int
-) -> Float32[Array, "n 8"]:
+    pixels: Float32[Array, "h w c"], rays: Float[Array, "4"], config: ViewConfig, seed: int
+) -> Float32[Array, "n s"]:
     v, u = np.nonzero(pixels[..., k.Z] > 0)
     order = np.random.default_rng(seed).permutation(len(u))[: config.samples]
     u, v = u[order], v[order]
     seen = pixels[v, u]
     directions = np.stack([rays[2] + rays[0] * u, rays[3] + rays[1] * v, np.ones(len(u))], -1)
     points = directions * seen[:, k.Z, None]
-    return np.concatenate([points, seen[:, k.NX : k.NZ + 1], seen[:, k.SHARP : k.SMOOTH + 1]], -1).astype(np.float32)
+    return np.concatenate([points, seen[:, k.NX : k.NZ + 1], seen[:, k.SHARP :]], -1).astype(np.float32)
 
 
 class ViewStore:
@@ -275,7 +281,7 @@ class ViewStore:
         sizes = [0 if c is None else int(c.mask.size) for c in crops]
         self.optics, self.crops, self.config = optics, crops, config
         self.maps = np.zeros((sum(sizes), k.CHANNELS), dtype=np.float32)
-        self.samples = np.zeros((config.samples * len(crops), 8), dtype=np.float32)
+        self.samples = np.zeros((config.samples * len(crops), k.SAMPLE), dtype=np.float32)
         self.table: Int64[Array, "n 7"] = np.zeros((len(crops), 7), dtype=np.int64)
         self.center_m = np.full((len(crops), 3), np.nan)
         self.motion: list[Float[Array, "4 4"] | None] = [None] * len(crops)
@@ -325,24 +331,27 @@ class ViewStore:
         return out
 
 
-def exposure_gains(
-    frames: list[UInt8[Array, "h w 3"]], masks: list[Bool[Array, "h w"]], step: int = 8
-) -> Float[Array, " n"]:
+class Exposure:
     """Brightness of each frame against the first, from pixels that belong to the object in neither (median of ratios).
 
     1 where the background tells nothing. The response is not linear: a ratio of stored values serves small gains well.
     """
-    kernel = np.ones((3, 3), np.uint8)
-    small = [cv2.resize(f, None, fx=1 / step, fy=1 / step, interpolation=cv2.INTER_AREA).astype(np.float32).mean(-1)
-             for f in frames]  # fmt: skip
-    free = [
-        cv2.dilate(cv2.resize(m.astype(np.uint8), s.shape[::-1], interpolation=cv2.INTER_AREA), kernel, iterations=2)
-        == 0
-        for m, s in zip(masks, small)
-    ]
-    gains = np.ones(len(frames))
-    for i in range(1, len(frames)):
-        use = free[0] & free[i] & (small[0] > 15) & (small[0] < 235) & (small[i] > 10) & (small[i] < 240)
-        if use.sum() > 50:
-            gains[i] = float(np.median(small[i][use] / small[0][use]))
-    return gains
+
+    def __init__(self, step: int = 8) -> None:
+        self._step = step
+        self._first: tuple[Float32[Array, "a b"], Bool[Array, "a b"]] | None = None
+
+    def gain(self, color_rgb: UInt8[Array, "h w 3"], mask: Bool[Array, "h w"]) -> float:
+        share = 1 / self._step
+        small = (
+            cv2.resize(color_rgb, None, fx=share, fy=share, interpolation=cv2.INTER_AREA).mean(-1).astype(np.float32)
+        )
+        size = (small.shape[1], small.shape[0])
+        taken = cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0
+        free = cv2.dilate(taken.astype(np.uint8), np.ones((3, 3), np.uint8), iterations=2) == 0
+        if self._first is None:
+            self._first = (small, free)
+            return 1.0
+        first, first_free = self._first
+        use = first_free & free & (first > 15) & (first < 235) & (small > 10) & (small < 240)
+        return float(np.median(small[use] / first[use])) if int(use.sum()) > 50 else 1.0

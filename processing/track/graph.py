@@ -1,0 +1,230 @@
+"""Joint refinement: every view against every view that sees the same surface, all poses at once (Gauss-Newton).
+
+The residuals are the images themselves (depth, grey, outline) of each pair, so that a pair of far apart times closes a
+loop without a feature match; a weak pull towards free flight holds what the images leave open. Solved for twists
+(translation, rotation) of the object frame per view: object_from_camera <- exp(twist) object_from_camera.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from numpy import ndarray as Array
+
+from processing.track import kernels as k
+from processing.track.beam import Schedule, rows
+from processing.track.keyframes import view_directions
+from processing.track.motion import turn_between
+from processing.track.views import ViewStore
+from recordings.geometry import skew
+
+
+@dataclass(frozen=True)
+class GraphConfig:
+    """Which pairs are compared, how long, and how much free flight weighs."""
+
+    neighbours: int = 2
+    """Frames before and after that a view is compared with."""
+    loops: int = 6
+    """Views from near directions, whatever their time, that a view is compared with."""
+    co_visible_deg: float = 50.0
+    spread_in_time: int = 3
+    """Of frames nearer to each other in time than this, only one is taken for loops."""
+    schedule: Schedule = (
+        (1, 2, 0.006, 0.4, 0.008, 0.3),
+        (0, 3, 0.004, 0.4, 0.006, 0.5),
+        (0, 5, 0.0025, 0.3, 0.005, 1.0),
+    )
+    sure_cost: float = 0.08
+    """A pair that fits worse counts less."""
+    spin_change_rad_s: float = 0.7
+    """Standard deviation of the change of spin between frames in flight (not an impact)."""
+    velocity_change_m_s: float = 0.06
+    """... and of the velocity beyond gravity's share."""
+    shared_noise: float = 8.0
+    """A view's pairs share its noise: together they count as one, so many times over."""
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """What the pull towards free flight needs: times, gravity (camera axes), the body's middle (object frame),
+    and which views follow each other within one toss (views of other tosses have other numbers)."""
+
+    times_s: Float[Array, " n"]
+    toss: Int[Array, " n"]
+    gravity_camera_m_s2: Float[Array, "3"]
+    center_m: Float[Array, "3"]
+
+
+@dataclass(frozen=True, eq=False)
+class Refined:
+    """Poses after joint refinement, the covariance of each (twist of the object frame, translation first), the pairs
+    (i, k) and their figures: mean cost, share on the surface, share of violations."""
+
+    poses: Float[Array, "n 4 4"]
+    covariance: Float[Array, "n 6 6"]
+    pairs: Int[Array, "m 2"]
+    figures: Float[Array, "m 3"]
+
+
+def choose_pairs(
+    poses: Float[Array, "n 4 4"], use: Bool[Array, " n"], toss: Int[Array, " n"], center_m: Float[Array, "3"],
+    config: GraphConfig,
+) -> Int[Array, "m 2"]:  # fmt: skip
+    """Pairs (i, k) in both directions: neighbours in time, and views from near directions spread over time and tosses."""
+    index = np.flatnonzero(use)
+    directions = view_directions(poses[index], center_m)
+    cosine = np.clip(directions @ directions.T, -1, 1)
+    chosen: set[tuple[int, int]] = set()
+    for a, i in enumerate(index):
+        later = [int(j) for j in index[a + 1 : a + 1 + config.neighbours] if toss[j] == toss[i]]
+        taken = [int(i), *later]
+        chosen.update((int(i), j) for j in later)
+        wanted = config.loops
+        for b in np.argsort(-cosine[a]):
+            j = int(index[b])
+            if wanted == 0 or cosine[a, b] < np.cos(np.radians(config.co_visible_deg)):
+                break
+            if any(toss[j] == toss[t] and abs(j - t) < config.spread_in_time for t in taken):
+                continue
+            taken.append(j)
+            chosen.add((min(int(i), j), max(int(i), j)))
+            wanted -= 1
+    one_way = np.array(sorted(chosen), dtype=np.int64).reshape(-1, 2)
+    return np.concatenate([one_way, one_way[:, ::-1]])
+
+
+def refine(
+    store: ViewStore,
+    poses: Float[Array, "n 4 4"],
+    use: Bool[Array, " n"],
+    fixed: Bool[Array, " n"],
+    motion: Motion,
+    config: GraphConfig,
+) -> Refined:
+    """All poses in `use` at once; those in `fixed` stay. `poses` of other views are returned as they are."""
+    poses = poses.copy()
+    pairs = choose_pairs(poses, use, motion.toss, motion.center_m, config)
+    distance = float(np.median(np.linalg.norm(store.center_m[use], axis=1)))
+    free = np.flatnonzero(use & ~fixed)
+    place = np.full(len(poses), -1)
+    place[free] = np.arange(len(free))
+    figures = np.zeros((len(pairs), 3))
+    H = np.eye(6 * len(free))
+    for row in rows(config.schedule, distance):
+        for _ in range(int(row[k.STEPS])):
+            H, g, figures = _normal_equations(store, poses, use, pairs, place, row, motion, config)
+            step = -np.linalg.solve(H + np.diag(1e-6 * np.diag(H) + 1e-9), g).reshape(-1, 6)
+            for i, twist in zip(free, step):
+                size = max(np.linalg.norm(twist[:3]) / 0.03, np.linalg.norm(twist[3:]) / 0.2, 1.0)
+                poses[i] = poses[i] @ k.inverse(k.exponential(twist / size))
+            if np.abs(step[:, :3]).max(initial=0) < 3e-5 and np.abs(step[:, 3:]).max(initial=0) < 3e-4:
+                break
+    return Refined(poses, _covariances(H, free, len(poses)), pairs, figures)
+
+
+def _normal_equations(
+    store: ViewStore, poses: Float[Array, "n 4 4"], use: Bool[Array, " n"], pairs: Int[Array, "m 2"],
+    place: Int[Array, " n"], row: Float[Array, "6"], motion: Motion, config: GraphConfig,
+) -> tuple[Float[Array, "f f"], Float[Array, " f"], Float[Array, "m 3"]]:  # fmt: skip
+    count = int(place.max()) + 1
+    blocks, gradients = np.zeros((len(pairs), 6, 6)), np.zeros((len(pairs), 6))
+    figures = np.zeros((len(pairs), 3))
+    k.graph_terms(
+        poses, pairs, store.maps, store.samples, store.table, store.optics.focal, store.optics.center, row,
+        blocks, gradients, figures,
+    )  # fmt: skip
+    weight = 1.0 / (1.0 + (figures[:, 0] / config.sure_cost) ** 2) / config.shared_noise
+    blocks *= weight[:, None, None]
+    gradients *= weight[:, None]
+    H, g = np.zeros((count, count, 6, 6)), np.zeros((count, 6))
+    i, j = place[pairs[:, 0]], place[pairs[:, 1]]
+    for a, b, sign in ((i, i, 1), (j, j, 1), (i, j, -1), (j, i, -1)):
+        ok = (a >= 0) & (b >= 0)
+        np.add.at(H, (a[ok], b[ok]), sign * blocks[ok])
+    np.add.at(g, i[i >= 0], gradients[i >= 0])
+    np.add.at(g, j[j >= 0], -gradients[j >= 0])
+    _add_motion(H, g, poses, use, place, motion, config)
+    return H.transpose(0, 2, 1, 3).reshape(6 * count, 6 * count), g.reshape(-1), figures
+
+
+def _add_motion(
+    H: Float[Array, "f f 6 6"], g: Float[Array, "f 6"], poses: Float[Array, "n 4 4"], use: Bool[Array, " n"],
+    place: Int[Array, " n"], motion: Motion, config: GraphConfig,
+) -> None:  # fmt: skip
+    """Adds the pull towards constant spin and ballistic centre over each three views in a row; impacts are outliers
+    (Geman-McClure). The residuals are changes of spin (rad/s) and of velocity (m/s), camera axes."""
+    index = np.flatnonzero(use)
+    for a, b, c in zip(index, index[1:], index[2:]):
+        if motion.toss[a] != motion.toss[c]:
+            continue
+        residual, jacobians = motion_residual((poses[a], poses[b], poses[c]), motion.times_s[[a, b, c]], motion)
+        spin, speed = residual[:3] / config.spin_change_rad_s, residual[3:] / config.velocity_change_m_s
+        w_spin = 1.0 / (1.0 + spin @ spin / 4.0) ** 2 / config.spin_change_rad_s**2
+        w_speed = 1.0 / (1.0 + speed @ speed / 4.0) ** 2 / config.velocity_change_m_s**2
+        w = np.array([w_spin] * 3 + [w_speed] * 3)
+        for x, jx in zip((a, b, c), jacobians):
+            if place[x] < 0:
+                continue
+            g[place[x]] += jx.T @ (w * residual)
+            for y, jy in zip((a, b, c), jacobians):
+                if place[y] >= 0:
+                    H[place[x], place[y]] += jx.T @ (w[:, None] * jy)
+
+
+def motion_residual(
+    three: tuple[Float[Array, "4 4"], Float[Array, "4 4"], Float[Array, "4 4"]],
+    times_s: Float[Array, "3"],
+    motion: Motion,
+) -> tuple[Float[Array, "6"], list[Float[Array, "6 6"]]]:
+    """Change of spin and of velocity over three poses (gravity's share taken off where that is nearer to the truth of
+    a flying body than of a held one), and its derivatives by the three twists, to first order."""
+    steps = np.diff(times_s)
+    spins = [turn_between(three[n + 1], three[n]) / steps[n] for n in (0, 1)]
+    centers = [p[:3, :3] @ motion.center_m + p[:3, 3] for p in three]
+    change = (centers[2] - centers[1]) / steps[1] - (centers[1] - centers[0]) / steps[0]
+    flight = motion.gravity_camera_m_s2 * 0.5 * (steps[0] + steps[1])
+    if np.linalg.norm(change - flight) < np.linalg.norm(change):
+        change = change - flight
+    residual = np.concatenate([spins[1] - spins[0], change])
+    jacobians = []
+    for pose, share in zip(three, (1 / steps[0], -1 / steps[0] - 1 / steps[1], 1 / steps[1])):
+        J = np.zeros((6, 6))
+        J[:3, 3:] = -share * pose[:3, :3]
+        J[3:, :3] = -share * pose[:3, :3]
+        J[3:, 3:] = share * pose[:3, :3] @ skew(motion.center_m)
+        jacobians.append(J)
+    return residual, jacobians
+
+
+def _covariances(H: Float[Array, "f f"], free: Int[Array, " f"], n: int) -> Float[Array, "n 6 6"]:
+    """Each free view's own block of the inverse; zero for the fixed, NaN elsewhere is left to the caller."""
+    out = np.zeros((n, 6, 6))
+    inverse = np.linalg.inv(H + 1e-9 * np.trace(H) / len(H) * np.eye(len(H)))
+    for a, i in enumerate(free):
+        out[i] = inverse[6 * a : 6 * a + 6, 6 * a : 6 * a + 6]
+    return out
+
+
+def flight_center(
+    poses: Float[Array, "n 4 4"], times_s: Float[Array, " n"], gravity_camera_m_s2: Float[Array, "3"],
+    flying: Int[Array, " m"], guess_m: Float[Array, "3"], sigma_m: float = 0.03,
+) -> Float[Array, "3"]:  # fmt: skip
+    """Centre of mass (object frame) from views in free flight: R_i c + t_i = p + v t + g t^2 / 2, least squares for
+    c, p, v, held to `guess_m` with `sigma_m`. The guess where there are too few views."""
+    if len(flying) < 5:
+        return guess_m
+    t = times_s[flying] - times_s[flying[0]]
+    m = len(flying)
+    A = np.zeros((3 * m + 3, 9))
+    b = np.zeros(3 * m + 3)
+    for n, i in enumerate(flying):
+        A[3 * n : 3 * n + 3, :3] = poses[i, :3, :3]
+        A[3 * n : 3 * n + 3, 3:6] = -np.eye(3)
+        A[3 * n : 3 * n + 3, 6:] = -t[n] * np.eye(3)
+        b[3 * n : 3 * n + 3] = 0.5 * gravity_camera_m_s2 * t[n] ** 2 - poses[i, :3, 3]
+    fit_m = 0.002
+    A[-3:, :3], b[-3:] = fit_m / sigma_m * np.eye(3), fit_m / sigma_m * guess_m
+    return np.asarray(np.linalg.lstsq(A, b, rcond=None)[0][:3])
