@@ -38,7 +38,7 @@ PAIR_WITHIN_PERIODS = 0.75
 """A depth image belongs to a colour image when it is nearer than this share of the frame period."""
 
 
-class Frames(Sequence[T_co], Generic[T_co]):
+class Frames(Sequence, Generic[T_co]):  # not Sequence[T_co]: type checks in tests would decode a frame at every call
     """Frames of one stream, decoded when asked for. `times_ns` are mid-exposure times."""
 
     def __init__(self, times_ns: Int64[Array, " n"], load: Callable[[int], T_co]) -> None:
