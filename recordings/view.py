@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import sys
 import uuid
@@ -19,6 +20,7 @@ from recordings.session_writer import write_bytes
 from recordings.view_arm import known_arm, log_arm_model, log_arm_motion
 from recordings.view_blueprint import ABOUT, about_text, blueprint
 from recordings.view_bodies import log_bodies, log_rig
+from recordings.view_file import PipedFile
 from recordings.view_layers import EVENTS, TIME, Clock, Look, log_toss
 from recordings.view_scene import Scene, moment_ns, result_bodies, results_scene, session_scene
 from recordings.view_viewer import Viewer, ViewerFailed, run_rerun
@@ -52,15 +54,24 @@ def save_rrd(path: Path, out: Path, choice: Choice = Choice(), look: Look = LOOK
         if scene is None:
             run_rerun("mcap", "convert", str(path), "-o", str(partial))
         else:
-            recording = _recording(scene)
-            recording.save(partial, default_blueprint=blueprint(scene))
-            fill(recording, scene, look, progress)
-            recording.disconnect()
+            _write(scene, partial, look, progress)
         partial.replace(out)
     except OSError as refused:
         raise WriteFailed(f"{out} cannot be written: {refused.strerror}") from refused
     finally:
-        partial.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            partial.unlink(missing_ok=True)
+
+
+def _write(scene: Scene, out: Path, look: Look, progress: Progress) -> None:
+    recording = _recording(scene)
+    file = PipedFile(out)
+    try:
+        recording.save(file.path, default_blueprint=blueprint(scene))
+        fill(recording, scene, look, progress)
+    finally:
+        recording.disconnect()
+        file.close()
 
 
 def screenshot(
@@ -105,7 +116,6 @@ def stream(scene: Scene, viewer: Viewer, look: Look = LOOK, progress: Progress =
     recording = _recording(scene)
     recording.connect_grpc(viewer.url, default_blueprint=blueprint(scene))
     fill(recording, scene, look, progress)
-    recording.flush()
     recording.disconnect()
 
 
@@ -151,13 +161,22 @@ def fill(recording: rr.RecordingStream, scene: Scene, look: Look, progress: Prog
         if robot is not None:
             log_arm_motion(recording, scene, robot, toss)
         log_toss(recording, scene, toss, look, progress)
-        recording.flush()  # the end is the last to arrive: who sees it has all of the toss
+        flush(recording)  # the end is the last to arrive: who sees it has all of the toss
         clock.at(end_ns).log(EVENTS, rr.TextLog(f"toss {toss}: recording ends"))
+        flush(recording)
+
+
+def flush(recording: rr.RecordingStream) -> None:
+    """Wait until everything logged so far is sent on. Raises ViewerFailed where nobody takes it any more."""
+    try:
+        recording.flush()
+    except RuntimeError as lost:
+        raise ViewerFailed(f"the recording was not sent to its end ({lost}); was the viewer closed?") from lost
 
 
 def clear(recording: rr.RecordingStream) -> None:
     """Nothing of the toss before is left in the picture when the next one begins."""
-    for entity in ("world/seen_by", "world/cameras", "depth", "world/path"):
+    for entity in ("world/seen_by", "world/cameras", "world/path", "flat", "depth"):
         recording.log(entity, rr.Clear(recursive=True))
 
 

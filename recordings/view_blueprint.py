@@ -10,7 +10,7 @@ from numpy import ndarray as Array
 
 from recordings.view_arm import BASE
 from recordings.view_bodies import BODY, PATH
-from recordings.view_layers import ARM, COLOR, DEPTH, EVENTS, FRAMES, HEALTH, MOTION, TIME, Clock
+from recordings.view_layers import ARM, DEPTH, EVENTS, FRAMES, HEALTH, MOTION, TIME, Clock, image_entity
 from recordings.view_scene import Scene, root_poses
 
 ABOUT = "about"
@@ -79,7 +79,7 @@ def centre_m(scene: Scene) -> Float[Array, "3"]:
 def reach_m(scene: Scene, target: Float[Array, "3"]) -> float:
     """How far the look stands back, so that every device fits in."""
     far = np.linalg.norm(device_places_m(scene) - target, axis=1)
-    return float(np.clip(far.max(initial=0.5) * 1.3, 0.7, 4.0))
+    return float(np.clip(far.max(initial=0.5) * 1.5, 0.8, 4.0))
 
 
 def device_places_m(scene: Scene) -> Float[Array, "n 3"]:
@@ -96,10 +96,10 @@ def _images(scene: Scene) -> rrb.Container | None:
     """Colour and depth in one row, the ground-truth cameras in the next."""
     cameras = sorted({name for toss in scene.tosses for name in _cameras(scene, toss)})
     mono = [name for name in cameras if _is_mono(scene, name)]
-    first = [rrb.Spatial2DView(origin=COLOR.format(c), name=f"Colour of {c}") for c in cameras if c not in mono]
+    first = [rrb.Spatial2DView(origin=image_entity(scene, c), name=f"Colour of {c}") for c in cameras if c not in mono]
     if any(_has_depth(scene, toss) for toss in scene.tosses):
         first.append(rrb.Spatial2DView(origin=DEPTH.format("d455"), name="Depth"))
-    second = [rrb.Spatial2DView(origin=COLOR.format(name), name=name) for name in mono]
+    second = [rrb.Spatial2DView(origin=image_entity(scene, name), name=name) for name in mono]
     rows = [rrb.Horizontal(*views) for views in (first, second) if views]
     return rrb.Vertical(*rows, row_shares=[3, 2][: len(rows)], name="Images") if rows else None
 

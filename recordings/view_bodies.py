@@ -10,13 +10,12 @@ from jaxtyping import Bool, Float, Int64
 from numpy import ndarray as Array
 
 from recordings.geometry import CameraModel, Transform, quaternion_from_rotation, rotation_angle_rad
-from recordings.tracks import RigCalibration, TagPlacement
-from recordings.view_layers import COLOR, MOTION, Clock, Look
+from recordings.tracks import TagPlacement
+from recordings.view_layers import CAMERA, MOTION, Clock, Look, image_entity
 from recordings.view_mesh import Outline, shaded_mesh
 from recordings.view_scene import Body, Color, Scene, root_poses
 
 BODY, PATH, TAGS = "world/object/{}", "world/path/{}", "world/table_tags"
-OUTLINE, TAGS_SEEN = COLOR + "/outline_{}", COLOR + "/table_tags"
 CAMERA_COLORS: dict[bool, Color] = {True: (90, 170, 255), False: (170, 170, 170)}
 TAG_COLOR: Color = (255, 225, 60)
 SOLID = 190
@@ -34,7 +33,7 @@ def log_rig(recording: rr.RecordingStream, scene: Scene, look: Look) -> None:
     for name, model in scene.calibration.cameras.items():
         if not name.endswith("_depth"):
             log_camera(recording, scene, name, model, look)
-    log_table_tags(recording, scene.calibration)
+    log_table_tags(recording, scene)
 
 
 def log_camera(recording: rr.RecordingStream, scene: Scene, name: str, model: CameraModel, look: Look) -> None:
@@ -43,7 +42,7 @@ def log_camera(recording: rr.RecordingStream, scene: Scene, name: str, model: Ca
     if place is None:
         return
     color = CAMERA_COLORS["mono" not in name]
-    holder = f"world/cameras/{name}"
+    holder = CAMERA.format(name)
     recording.log(holder, placed(place), static=True)
     recording.log(f"{holder}/name", rr.Points3D([[0, 0, 0]], labels=[name], colors=[color], radii=[0.004]), static=True)
     pinhole = rr.Pinhole(
@@ -53,27 +52,27 @@ def log_camera(recording: rr.RecordingStream, scene: Scene, name: str, model: Ca
         image_plane_distance=look.frustum_m,
         color=color,
     )
-    recording.log(COLOR.format(name), pinhole, static=True)
+    recording.log(image_entity(scene, name), pinhole, static=True)
 
 
-def log_table_tags(recording: rr.RecordingStream, calibration: RigCalibration) -> None:
+def log_table_tags(recording: rr.RecordingStream, scene: Scene) -> None:
     """Where the calibration has the table's tags: outlines on the table and, through the lens, in every image."""
-    tags = calibration.table_tags
-    if not tags:
+    tags, world = scene.calibration.table_tags, scene.root_from("world")
+    if not tags or world is None:
         return
     corners = [tag_corners_world(tag) for tag in tags]
     labels = [f"tag {tag.tag_id}" for tag in tags]
     loops = [np.vstack([c, c[:1]]) for c in corners]
     recording.log(TAGS, rr.LineStrips3D(loops, colors=[TAG_COLOR], labels=labels, radii=0.0015), static=True)
-    for name, model in calibration.cameras.items():
-        camera_from_world = calibration.find(model.frame, "world")
+    for name, model in scene.calibration.cameras.items():
+        camera_from_world = scene.calibration.find(model.frame, "world")
         if camera_from_world is None or name.endswith("_depth"):
             continue
         seen = [model.project(camera_from_world.points(loop)) for loop in loops]
         seen = [pixels for pixels in seen if model.sees(pixels).all()]
         if seen:
             strips = rr.LineStrips2D(seen, colors=[TAG_COLOR], radii=-1.0)
-            recording.log(TAGS_SEEN.format(name), strips, static=True)
+            recording.log(f"{image_entity(scene, name)}/table_tags", strips, static=True)
 
 
 def tag_corners_world(tag: TagPlacement) -> Float[Array, "4 3"]:
@@ -205,7 +204,7 @@ def log_outlines(
             root_from_object = Transform.from_matrix(scene.root, shape.object_frame, matrix)
             segments = list(outline.segments(model, camera_from_root @ root_from_object))
         strips = rr.LineStrips2D(segments, colors=[body.color], radii=-1.0)
-        clock.at(int(time_ns)).log(OUTLINE.format(camera, body.name), strips)
+        clock.at(int(time_ns)).log(f"{image_entity(scene, camera)}/outline_{body.name}", strips)
 
 
 def placed(place: Transform) -> rr.Transform3D:

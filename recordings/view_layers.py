@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import rerun as rr
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Float32, UInt8
 from numpy import ndarray as Array
 
 from recordings.codec import decode_image
@@ -17,7 +17,7 @@ from recordings.session import Toss
 from recordings.view_scene import Scene
 
 TIME, TOSS = "time", "toss"
-COLOR, DEPTH, CLOUD = "world/cameras/{}/image", "depth/{}", "world/seen_by/{}"
+CAMERA, FLAT, DEPTH, CLOUD = "world/cameras/{}", "flat/{}", "depth/{}", "world/seen_by/{}"
 ARM, FRAMES, MOTION, EVENTS, HEALTH = "arm", "frames", "object", "events", "health"
 JPEG_QUALITY = 90
 LEVELS = {"info": rr.TextLogLevel.INFO, "warning": rr.TextLogLevel.WARN, "error": rr.TextLogLevel.ERROR}
@@ -79,14 +79,22 @@ def log_toss(recording: rr.RecordingStream, scene: Scene, toss: int, look: Look,
     log_words(clock, recorded)
 
 
+def image_entity(scene: Scene, camera: str) -> str:
+    """Where a camera's images are logged: on its frustum in the world, or apart where its place is not known."""
+    model = scene.calibration.cameras.get(camera)
+    if model is None or scene.root_from(model.frame) is None:
+        return FLAT.format(camera)
+    return f"{CAMERA.format(camera)}/image"
+
+
 def log_images(clock: Clock, scene: Scene, toss: Toss, camera: str) -> None:
-    """Every image of a camera, as it was compressed by the device; the given masks over it."""
+    """Every image of a camera, compressed as the device did it; the given masks over the colour camera's."""
     frames = toss.color(camera) if len(toss.color(camera)) else toss.mono(camera)
     for image in frames:
-        clock.at(image.time_ns).log(COLOR.format(camera), drawn_image(image))
+        clock.at(image.time_ns).log(image_entity(scene, camera), drawn_image(image))
     if f"/{camera}/color" not in toss.file.channels:
         return
-    entity = f"{COLOR.format(camera)}/mask"
+    entity = f"{image_entity(scene, camera)}/mask"
     for position, mask in toss.masks().items():
         if not 0 <= position < len(frames):
             continue
@@ -153,8 +161,13 @@ class Thinned:
     def cloud(self, frame: RgbdFrame, root_from_camera: Transform, look: Look) -> rr.Points3D:
         """The frame's point cloud in the root frame; points grow with their distance to their neighbours."""
         points, colors = self.points(frame, look.cloud_reach_m)
-        radii = (0.5 * look.cloud_fill * self.spread * points[:, 2]).astype(np.float32)
-        return rr.Points3D(root_from_camera.points(points).astype(np.float32), colors=colors, radii=radii)
+        radii = 0.5 * look.cloud_fill * self.spread * points[:, 2]
+        return rr.Points3D(short(root_from_camera.points(points)), colors=colors, radii=short(radii))
+
+
+def short(values: Float[Array, "*n"]) -> Float32[Array, "*n"]:
+    """Rounded to 1/2048 m, half a millimetre: with zeros at their end, floats compress to two thirds in an .rrd."""
+    return (np.round(values * 2048) / 2048).astype(np.float32)
 
 
 def log_arm(clock: Clock, toss: Toss) -> None:

@@ -25,6 +25,7 @@ NOTICES_GONE_S = 5.0
 """The viewer greets with notices over its window for about four seconds; no command takes them away."""
 SAME_PICTURES = 3
 """A picture is complete when this many in a row are the same bytes and the viewer reports nothing as loading."""
+NO_ADAPTER = "No graphics adapter was found"
 NO_VULKAN = (
     "the viewer found no graphics driver; without a graphics card it draws with Mesa's: "
     "`apt-get install -y libvulkan1 mesa-vulkan-drivers`"
@@ -46,10 +47,11 @@ def rerun_program() -> str:
 
 
 def run_rerun(*arguments: str) -> None:
-    """Run rerun's command line to its end. Raises BadInput with its last words where it fails."""
-    done = subprocess.run([rerun_program(), *arguments], capture_output=True, text=True, check=False)
+    """Run rerun's command line to its end. Raises BadInput with what it said where it fails."""
+    environment = {**os.environ, "NO_COLOR": "1", "RUST_LOG": "error"}
+    done = subprocess.run([rerun_program(), *arguments], capture_output=True, text=True, check=False, env=environment)
     if done.returncode != 0:
-        raise BadInput(f"rerun {' '.join(arguments[:2])}: {_last_words(done.stderr or done.stdout)}")
+        raise BadInput(f"`rerun {' '.join(arguments)}` failed: {_gist(done.stderr + done.stdout)}")
 
 
 class Viewer:
@@ -171,20 +173,19 @@ class Viewer:
                 except (RuntimeError, ConnectionError, OSError, ValueError):
                     pass  # it listens before it draws: ask again
             if time.monotonic() > deadline:
-                raise ViewerFailed(f"the viewer did not answer within {START_TIMEOUT_S:.0f} s: {self._words()}")
+                raise ViewerFailed(f"the viewer did not answer within {START_TIMEOUT_S:.0f} s: {_gist(self._words())}")
             time.sleep(POLL_S)
 
     def _refuse_dead(self) -> None:
         if self._process is not None and self._process.poll() is not None:
             words = self._words()
-            lacks = any(w in words.lower() for w in ("graphics adapter", "vulkan", "wgpu", "no adapter"))
-            raise ViewerFailed(NO_VULKAN if lacks else f"the viewer ended at once: {words}")
+            raise ViewerFailed(NO_VULKAN if NO_ADAPTER in words else f"the viewer ended at once: {_gist(words)}")
 
     def _words(self) -> str:
         if self._log is None:
             return ""
         self._log.seek(0)
-        return _last_words(self._log.read().decode(errors="replace"))
+        return self._log.read().decode(errors="replace")
 
 
 def free_port() -> int:
@@ -209,5 +210,8 @@ def _refuse_broken(state: ViewerState) -> None:
                 )
 
 
-def _last_words(text: str, lines: int = 5) -> str:
-    return " | ".join(line.strip() for line in text.strip().splitlines()[-lines:]) or "no message"
+def _gist(text: str) -> str:
+    """The line that says what went wrong: a panic's, else the last one that says anything."""
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
+    telling = [line for line in lines if "panicked at" in line or "rror" in line]
+    return (telling or lines[-1:] or ["it said nothing"])[0]
