@@ -127,7 +127,7 @@ class MonoConfig:
     exposure_s: float = 0.001
     trigger_delay_s: float = 0.0061
     """Against the nominal colour grid."""
-    noise: float = 1.0
+    noise: float = 0.5
     jpeg_quality: int = 95
     subframes: int = 4
     tosses: tuple[int, ...] | None = None

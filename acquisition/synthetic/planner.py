@@ -21,8 +21,8 @@ from recordings.errors import BadInput
 
 TRIES = 300
 NEAREST_OBJECT_M = 0.3
-LOWEST_CORNER_M = -0.03
-"""Of the bounding box, which may reach below the table where the object itself does not."""
+LOWEST_POINT_M = -0.01
+"""An impact may press the object so deep into the table, a hand may not."""
 HELD_STEP_S = 0.004
 ROLL_RAD = 0.5
 LOOKS = 40
@@ -103,10 +103,10 @@ class Planner:
         """Whether the object is inside the image, not too near to the camera, and over the table, all the time."""
         camera = self._view.camera
         for time_s in part.times_s[:: max(1, len(part.times_s) // LOOKS)]:
-            corners = part.at(time_s).points(self._body.corners_m)
-            local = self._view.camera_from_world.points(corners)
+            points = part.at(time_s).points(self._solid.vertices_m)
+            local = self._view.camera_from_world.points(points)
             if local[:, 2].min() < NEAREST_OBJECT_M or not camera.sees(camera.project(local)).all():
                 return False
-            if corners[:, 2].min() < LOWEST_CORNER_M or (np.abs(corners[:, :2]) > TABLE_HALF_M).any():
+            if points[:, 2].min() < LOWEST_POINT_M or (np.abs(points[:, :2]) > TABLE_HALF_M).any():
                 return False
         return True

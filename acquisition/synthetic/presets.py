@@ -9,6 +9,7 @@ from acquisition.synthetic.config import (
     ArmConfig,
     CameraConfig,
     ColorConfig,
+    ContactConfig,
     DepthConfig,
     ErrorConfig,
     MonoConfig,
@@ -32,7 +33,7 @@ BOX = _object("box", "textured", "speckled")
 TOSSED_BY_ARM = replace(
     _object("prism", "textured", mass_kg=0.12),
     arm=ArmConfig(),
-    camera=CameraConfig(distance_m=0.85, distortion=(-0.055, 0.065, 0.0006, -0.0004, -0.02)),
+    camera=CameraConfig(distance_m=0.95, distortion=(-0.055, 0.065, 0.0006, -0.0004, -0.02)),
     motion=MotionConfig(release_height_m=0.3, forward_speed_m_s=0.7, upward_speed_m_s=0.45, spin_rad_s=4.0),
 )
 
@@ -97,6 +98,28 @@ PRESETS: dict[str, SceneConfig] = {
     "mono": replace(TAGGED, mono=MonoConfig(board_views=12)),
     "no-release-time": replace(BOX, say_release=False),
 }
+
+
+SAMPLE_TOSSES = 4
+SAMPLE = replace(
+    USUAL,
+    seed=11,
+    object=ObjectConfig("box", (0.12, 0.1, 0.08), "tagged", mass_kg=0.3),
+    contact=ContactConfig(friction=0.2),
+    camera=CameraConfig(width=352, height=264, focal_px=480.0, distance_m=0.7, elevation_deg=36.0),
+    motion=MotionConfig(
+        release_height_m=0.3,
+        forward_speed_m_s=0.4,
+        upward_speed_m_s=0.6,
+        spin_rad_s=6.0,
+        hold_s=0.14,
+        lead_in_s=0.17,
+        rest_s=0.21,
+    ),
+    mono=MonoConfig(width=480, height=360, distance_m=0.75, tosses=(0,), jpeg_quality=90),
+    table="plain",
+)
+"""The session that the repository ships: small pictures, mono images for its first toss only."""
 
 
 def preset(name: str, seed: int | None = None) -> SceneConfig:
