@@ -1,6 +1,6 @@
 """The parameter vector of a fit, and the optimisers: L-BFGS for a box, Adam with a cosine schedule for free points.
 
-Layout of a parameter vector: shape | square root of friction | inertia (6) | centre of mass (3, in SCALE_M).
+Layout of a parameter vector: shape | square root of friction | inertia (6) | centre of mass (3) | plane (1); lengths in SCALE_M.
 """
 
 from __future__ import annotations
@@ -17,7 +17,10 @@ from torch import Tensor
 from processing.contact.geometry import SCALE_M, Geometry
 from processing.contact.inertia import inertia_from
 from processing.contact.loss import Body, LossValue, StepData, Weights, contact_loss
+from recordings.errors import BadInput
 
+SHAPE, FRICTION, INERTIA, CENTER, PLANE = slice(None, -11), -11, slice(-10, -4), slice(-4, -1), -1
+"""Where a parameter vector keeps what."""
 LOSS_SCALE = 1e4
 """Brings the loss (J) to order one for the optimisers' tolerances."""
 
@@ -28,6 +31,9 @@ class FitConfig:
     """Inertia over mass, always physical."""
     learn_center: bool = False
     """The centre of mass against the prior's."""
+    learn_shape: bool = True
+    learn_plane: bool = False
+    """Only where the shape is known: size and plane height together are not identifiable."""
     friction_start: float = 0.03
     lbfgs_iterations: int = 40
     """For a box."""
@@ -47,20 +53,32 @@ class Model:
     inertia_start_kgm2: Float[Array, "3 3"]
     config: FitConfig
 
+    def __post_init__(self) -> None:
+        if self.config.learn_plane and self.config.learn_shape:
+            raise BadInput(
+                "the size of the object and the height of the plane cannot both be learned: raising the plane looks like "
+                "shrinking the object; calibrate the plane (`toss-calibrate table SESSION`) or keep the shape fixed"
+            )
+
     def start(self) -> Float[Array, " p"]:
         shape = self.geometry.start()
-        return np.concatenate([shape, [self.config.friction_start**0.5], np.zeros(9)])
+        return np.concatenate([shape, [self.config.friction_start**0.5], np.zeros(10)])
 
     def learned(self) -> Bool[Array, " p"]:
         count = len(self.geometry.start())
-        flags = [True] * (count + 1) + [self.config.learn_inertia] * 6 + [self.config.learn_center] * 3
+        c = self.config
+        flags = [c.learn_shape] * count + [True] + [c.learn_inertia] * 6 + [c.learn_center] * 3 + [c.learn_plane]
         return np.array(flags, dtype=bool)
 
     def body(self, parameters: Float[Tensor, " p"]) -> Body:
         inertia0 = torch.as_tensor(self.inertia_start_kgm2, dtype=parameters.dtype, device=parameters.device)
-        inertia = inertia_from(parameters[-9:-3], inertia0) if self.config.learn_inertia else inertia0
+        inertia = inertia_from(parameters[INERTIA], inertia0) if self.config.learn_inertia else inertia0
         return Body(
-            self.geometry.points(parameters[:-10]), parameters[-10].square(), inertia, SCALE_M * parameters[-3:]
+            self.geometry.points(parameters[SHAPE]),
+            parameters[FRICTION].square(),
+            inertia,
+            SCALE_M * parameters[CENTER],
+            SCALE_M * parameters[PLANE],
         )
 
     def numbers(self, parameters: Float[Array, " p"]) -> Body:

@@ -60,12 +60,14 @@ class ContactTerms:
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """What a parameter vector stands for. Points and `center_m` are relative to the prior's centre of mass."""
+    """What a parameter vector stands for. Points and `center_m` are relative to the prior's centre of mass; the plane
+    lies `plane_m` above z = 0."""
 
     points_m: Float[Tensor, "v 3"]
     friction: Float[Tensor, ""]
     inertia_kgm2: Float[Tensor, "3 3"]
     center_m: Float[Tensor, "3"]
+    plane_m: Float[Tensor, ""]
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,7 +144,7 @@ def find_contacts(
     """The lowest points at each pose; heights are above the plane."""
     arms = body.points_m - body.center_m
     up = rotation[:, 2]
-    center_z = position_m[:, 2] + up @ body.center_m
+    center_z = position_m[:, 2] + up @ body.center_m - body.plane_m
     with torch.no_grad():
         heights = up @ arms.T
         count = min(contacts, heights.shape[1])

@@ -52,6 +52,7 @@ class _Bodies:
     friction: Float[Tensor, " n"]
     inertia_kgm2: Float[Tensor, "3 3"]
     center_m: Float[Tensor, "n 3"]
+    lift_m: Float[Tensor, "n 3"]
 
     @staticmethod
     def stack(bodies: Sequence[Body], owner: Sequence[int]) -> _Bodies:
@@ -59,9 +60,9 @@ class _Bodies:
             return torch.stack(values)[torch.as_tensor(owner, device=values[0].device)]
 
         centered = rows([b.points_m - b.center_m for b in bodies])
-        return _Bodies(
-            centered, rows([b.friction for b in bodies]), bodies[0].inertia_kgm2, rows([b.center_m for b in bodies])
-        )
+        lift = rows([b.plane_m for b in bodies])[:, None] * centered.new_tensor([0.0, 0.0, 1.0])
+        center = rows([b.center_m for b in bodies])
+        return _Bodies(centered, rows([b.friction for b in bodies]), bodies[0].inertia_kgm2, center, lift)
 
     def lowest(
         self, rotation: Float[Tensor, "n 3 3"], position_m: Float[Tensor, "n 3"], contacts: int
@@ -88,7 +89,7 @@ def simulate(
         return torch.as_tensor(values, dtype=torch.float64, device=body.points_m.device)
 
     rotation, spin = tensor(start.rotation), tensor(start.spin_object_rad_s)
-    position = tensor(start.position_m) + _turn(rotation, body.center_m)
+    position = tensor(start.position_m) + _turn(rotation, body.center_m) - body.lift_m
     velocity = tensor(start.velocity_world_m_s) + _turn(rotation, torch.linalg.cross(spin, body.center_m))
     warm = position.new_zeros((len(position), 6))
     rotations, positions, failures = [], [], 0
@@ -98,7 +99,7 @@ def simulate(
         rotation = rotation @ _exp(step_s * spin)
         position = position + step_s * velocity
         rotations.append(rotation)
-        positions.append(position - _turn(rotation, body.center_m))
+        positions.append(position - _turn(rotation, body.center_m) + body.lift_m)
     return Rollout(torch.stack(rotations, 1).cpu().numpy(), torch.stack(positions, 1).cpu().numpy(), failures)
 
 

@@ -1,0 +1,242 @@
+"""Does the data mean what it says? Step, scale, quaternion order, velocity frames, jumps, plane, duplicates.
+
+Every check is a physical law that the right reading fulfils: free fall accelerates at 9.81 m/s^2; velocities are
+differences of poses; an impulse at a point changes spin and velocity at right angles; a resting object touches the plane.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray as Array
+from scipy.spatial.transform import Rotation
+
+from processing.contact.motion import GRAVITY_M_S2, PoseSeries, differences
+from processing.contact.segment import Phases
+from recordings.errors import BadInput
+
+LEAST_FRAMES = 5
+MOST_SPEED_M_S, MOST_SPIN_RAD_S = 8.0, 45.0
+"""Beyond these, and beyond MOST_RATIO times the toss's median, a step between frames is a jump."""
+MOST_RATIO = 6.0
+FALL_TOLERANCE = 0.06
+"""Relative error of the acceleration of free fall; 0.06 is 3 % of the step or 6 % of the scale."""
+PLANE_TOLERANCE_M = 0.005
+SAME_HEIGHT_M = 1e-8
+SAME_FRAMES = 30
+IMPACT_M_S = 0.3
+
+
+def check_frames(series: PoseSeries) -> None:
+    """Raises BadInput for a toss that is too short, not in time order, or jumps."""
+    name = f"toss {series.toss}"
+    if len(series) < LEAST_FRAMES:
+        raise BadInput(f"{name}: {len(series)} frames with a pose; wanted at least {LEAST_FRAMES}")
+    if not (np.diff(series.time_s) > 0).all():
+        raise BadInput(f"{name}: the times of its poses do not grow; record or import it again")
+    states = differences(series)
+    speed = np.linalg.norm(states.velocity_world_m_s, axis=1)
+    spin = np.linalg.norm(states.spin_object_rad_s, axis=1)
+    for what, values, most in (("m/s", speed, MOST_SPEED_M_S), ("rad/s", spin, MOST_SPIN_RAD_S)):
+        limit = max(most, MOST_RATIO * float(np.median(values)))
+        if values.max() > limit:
+            raise BadInput(
+                f"{name}: the pose jumps at frame {int(values.argmax())} ({values.max():.1f} {what}, "
+                f"median {np.median(values):.1f}); wanted less than {limit:.0f}; track it again, or leave the toss out"
+            )
+
+
+def fall_m_s2(tosses: Sequence[PoseSeries], frames: int = 6) -> float | None:
+    """Vertical acceleration of free fall, upwards positive: the median over windows whose motion is a parabola with no
+    sideways acceleration. None where nothing falls."""
+    found = []
+    for series in tosses:
+        for first in range(0, len(series) - frames + 1):
+            t = series.time_s[first : first + frames]
+            p = series.position_m[first : first + frames]
+            fit = np.polynomial.polynomial.polyfit(t - t.mean(), p, 2)
+            left = p - np.polynomial.polynomial.polyval(t - t.mean(), fit).T
+            bend = 2 * fit[2]
+            falls = bend[2] * (t[-1] - t[0]) ** 2 / 8
+            if -falls > 8 * np.abs(left).max() and abs(bend[2]) > 20 * np.abs(bend[:2]).max():
+                found.append(float(bend[2]))
+    return float(np.median(found)) if len(found) >= 3 else None
+
+
+def check_fall(tosses: Sequence[PoseSeries]) -> float | None:
+    """The acceleration of free fall. Raises BadInput where it is not gravity's: the step or the scale is wrong."""
+    fall = fall_m_s2(tosses)
+    if fall is None or abs(-fall / GRAVITY_M_S2 - 1) <= FALL_TOLERANCE:
+        return fall
+    if fall > 0:
+        raise BadInput(f"free fall accelerates upwards ({fall:.2f} m/s^2): z of `world` must point up, against gravity")
+    step = tosses[0].step_s
+    raise BadInput(
+        f"free fall reads {-fall:.2f} m/s^2 instead of 9.81: either the time step is wrong ({step * 1e3:.3f} ms is said, "
+        f"{step * 1e3 * (-fall / GRAVITY_M_S2) ** 0.5:.3f} ms would fit) or the scale (1 m in the data would be "
+        f"{GRAVITY_M_S2 / -fall:.4f} m); import it again with the right `--dt` or `--scale`"
+    )
+
+
+def _permuted(series: PoseSeries) -> PoseSeries:
+    """What the poses would be if their quaternions had been stored as xyzw and read as wxyz."""
+    q = Rotation.from_matrix(series.rotation).as_quat()[:, [3, 0, 1, 2]]  # what was read, in the order it was stored
+    return replace(series, rotation=Rotation.from_quat(q).as_matrix())
+
+
+READINGS = {
+    "quaternions stored as x y z w (they were read as w x y z)": _permuted,
+    "inverse rotations (object_from_world)": lambda s: replace(s, rotation=np.swapaxes(s.rotation, 1, 2).copy()),
+}
+
+
+def impact_angle(tosses: Sequence[PoseSeries], inertia: Float[Array, "3 3"]) -> tuple[float, int]:
+    """|dL . dv| / (|dL| |dv|) over impacts, weighted by the product, and how many impacts: near 0 where orientations are
+    read right, about 0.5 where they are not. An impulse J at r gives m dv = J and dL = r x J."""
+    across = along = 0.0
+    count = 0
+    for series in tosses:
+        states = differences(series)
+        gravity = np.array([0.0, 0.0, -GRAVITY_M_S2])
+        dv = np.diff(states.velocity_world_m_s[1:], axis=0) - np.diff(series.time_s)[1:, None] * gravity
+        momentum = np.einsum("nij,jk,nk->ni", states.rotation, inertia, states.spin_object_rad_s)[1:]
+        dL = np.diff(momentum, axis=0)
+        hit = np.linalg.norm(dv, axis=1) > IMPACT_M_S
+        across += float(np.abs((dL * dv).sum(1))[hit].sum())
+        along += float((np.linalg.norm(dL, axis=1) * np.linalg.norm(dv, axis=1))[hit].sum())
+        count += int(hit.sum())
+    return (across / along if along > 0 else 0.0), count
+
+
+def check_orientations(tosses: Sequence[PoseSeries], inertia: Float[Array, "3 3"]) -> float:
+    """How far impacts are from a right angle (0..1). Raises BadInput where another reading of the rotations fits far better."""
+    here, count = impact_angle(tosses, inertia)
+    if count < 5:
+        return here
+    for name, read in READINGS.items():
+        other, _ = impact_angle([read(s) for s in tosses], inertia)
+        if here > 0.3 and other < 0.6 * here:
+            raise BadInput(
+                f"impacts do not fit the orientations (misfit {here:.2f}), but they do ({other:.2f}) when the rotations are "
+                f"{name}; import the data again in that reading"
+            )
+    return here
+
+
+def check_velocities(tosses: Sequence[PoseSeries]) -> None:
+    """Where a recording claims velocities: raises BadInput if they are not the differences of its poses, and says which
+    other frame or quaternion order would fit."""
+    claimed = [s for s in tosses if s.velocity_world_m_s is not None and s.spin_object_rad_s is not None]
+    if not claimed:
+        return
+    named = {
+        "linear velocity": _linear_gaps(claimed),
+        "angular velocity": _angular_gaps(claimed),
+    }
+    for what, (size, gaps) in named.items():
+        right, *others = gaps.items()
+        best = min(others, key=lambda item: item[1])
+        if right[1] > 0.25 * size and best[1] < 0.5 * right[1]:
+            raise BadInput(
+                f"the claimed {what} is not the difference of the poses (off by {right[1]:.3g}, typical size {size:.3g}), "
+                f"but it is ({best[1]:.3g}) read as {best[0]}; wanted: {right[0]}"
+            )
+        if right[1] > 0.25 * size:
+            raise BadInput(
+                f"the claimed {what} is not the difference of the poses (off by {right[1]:.3g}, typical size {size:.3g}): "
+                "check the time step"
+            )
+
+
+Gaps = tuple[float, dict[str, float]]
+
+
+def _median_gap(pairs: Sequence[tuple[Float[Array, "n 3"], Float[Array, "n 3"]]]) -> float:
+    return float(np.median(np.concatenate([np.linalg.norm(a - b, axis=1)[1:] for a, b in pairs])))
+
+
+def _linear_gaps(tosses: Sequence[PoseSeries]) -> Gaps:
+    found: dict[str, list] = {"metres per second in the world frame": [], "velocity in the object frame": []}
+    for s in tosses:
+        own = differences(s).velocity_world_m_s
+        given = np.asarray(s.velocity_world_m_s)
+        found["metres per second in the world frame"].append((given, own))
+        found["velocity in the object frame"].append((np.einsum("nij,nj->ni", s.rotation, given), own))
+    zero = [(own, np.zeros_like(own)) for _, own in found["metres per second in the world frame"]]
+    return _median_gap(zero), {name: _median_gap(pairs) for name, pairs in found.items()}
+
+
+def _angular_gaps(tosses: Sequence[PoseSeries]) -> Gaps:
+    body = "radians per second in the object frame, quaternions w x y z"
+    found: dict[str, list] = {body: [], "angular velocity in the world frame": [], "degrees per second": []}
+    found["quaternions stored as x y z w (they were read as w x y z)"] = []
+    for s in tosses:
+        own, given = differences(s).spin_object_rad_s, np.asarray(s.spin_object_rad_s)
+        found[body].append((given, own))
+        found["angular velocity in the world frame"].append((np.einsum("nji,nj->ni", s.rotation, given), own))
+        found["degrees per second"].append((np.radians(given), own))
+        permuted = differences(_permuted(s)).spin_object_rad_s
+        found["quaternions stored as x y z w (they were read as w x y z)"].append((given, permuted))
+    return _median_gap([(own, np.zeros_like(own)) for _, own in found[body]]), {
+        name: _median_gap(pairs) for name, pairs in found.items()
+    }
+
+
+def lowest_point_m(
+    series: PoseSeries, points_m: Float[Array, "v 3"], phases: Phases
+) -> float | None:
+    """Height of the lowest point above the plane (z = 0), median over the rest at the end. None where it does not rest."""
+    if phases.rest is None:
+        return None
+    rest = slice(phases.rest, None)
+    return float(np.median((series.rotation[rest, 2] @ points_m.T).min(1) + series.position_m[rest, 2]))
+
+
+def check_plane(heights_m: Mapping[int, float], what: str) -> float | None:
+    """The median height of the resting object's lowest point. Raises BadInput where it is more than 5 mm off the plane."""
+    if not heights_m:
+        return None
+    height = float(np.median(list(heights_m.values())))
+    if abs(height) > PLANE_TOLERANCE_M:
+        side = "above" if height > 0 else "below"
+        raise BadInput(
+            f"at rest the lowest point of {what} is {abs(height) * 1e3:.1f} mm {side} the plane (median of {len(heights_m)} "
+            f"tosses); wanted within {PLANE_TOLERANCE_M * 1e3:.0f} mm: calibrate the plane (`toss-calibrate table SESSION`) "
+            "or check the size of the shape"
+        )
+    return height
+
+
+def duplicate_groups(tosses: Sequence[PoseSeries]) -> list[tuple[int, ...]]:
+    """Groups of tosses that are one recording: equal heights over their first frames (turning about z keeps them)."""
+    groups: list[tuple[int, ...]] = []
+    taken: set[int] = set()
+    for i, a in enumerate(tosses):
+        if a.toss in taken:
+            continue
+        same = [b.toss for b in tosses[i + 1 :] if b.toss not in taken and _same_heights(a, b)]
+        if same:
+            groups.append((a.toss, *same))
+            taken.update(groups[-1])
+    return groups
+
+
+def _same_heights(a: PoseSeries, b: PoseSeries) -> bool:
+    n = min(len(a), len(b), SAME_FRAMES)
+    return bool(np.abs(a.position_m[:n, 2] - b.position_m[:n, 2]).max() < SAME_HEIGHT_M)
+
+
+def refuse_leaks(train: Sequence[int], test: Sequence[int], groups: Sequence[Sequence[int]]) -> None:
+    """Raises BadInput where a recording is both learned from and tested on."""
+    both = sorted(set(train) & set(test))
+    if both:
+        raise BadInput(f"tosses {both} are in --train and in --test; wanted two separate sets")
+    for group in groups:
+        learned, tested = sorted(set(group) & set(train)), sorted(set(group) & set(test))
+        if learned and tested:
+            raise BadInput(
+                f"toss {tested[0]} of --test is the same recording as toss {learned[0]} of --train; leave one of them out"
+            )

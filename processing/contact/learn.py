@@ -1,0 +1,373 @@
+"""Contact learning: tracks and a prior shape in, geometry, friction (inertia, centre of mass) with intervals out."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from numpy import ndarray as Array
+
+from processing.contact import data_checks as checks
+from processing.contact.fit import FRICTION, INERTIA, SHAPE, Fit, FitConfig, Model, fit
+from processing.contact.geometry import SCALE_M, GeometryName
+from processing.contact.inertia import Physics, inertia_from
+from processing.contact.intervals import Interval, Spread, bootstrap, curvature, extents
+from processing.contact.loss import REFERENCE_MASS_KG, Body, StepData, Weights, contact_loss
+from processing.contact.motion import PoseSeries, Steps, steps_of
+from processing.contact.prior import Frame, Prior, learned_shape
+from processing.contact.rollout import Start
+from processing.contact.smooth import Smoothed, smooth
+from processing.contact.unexplained import unexplained_rows
+from processing.contact.weights import HeldOut, Sweep, SweepConfig, sweep_weights
+from recordings.errors import BadInput
+from recordings.progress import Progress, Silent
+from recordings.tracks import ContactModel, ObjectShape
+
+
+@dataclass(frozen=True, eq=False)
+class Plane:
+    """The ground in `world`: normal . x = offset."""
+
+    normal_world: Float[Array, "3"] = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
+    offset_m: float = 0.0
+    source: str = "z = 0 of world"
+
+    def level_from_world(self) -> Float[Array, "3 3"]:
+        """The rotation that turns the normal to z by the shortest way."""
+        n = np.asarray(self.normal_world, dtype=np.float64) / np.linalg.norm(self.normal_world)
+        axis, cosine = np.cross(n, [0.0, 0.0, 1.0]), float(n[2])
+        if cosine < -0.99:
+            raise BadInput(f"the plane's normal {n.tolist()} points down; wanted up, against gravity")
+        K = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
+        return np.eye(3) + K + K @ K / (1 + cosine)
+
+
+@dataclass(frozen=True)
+class ContactConfig:
+    """Everything that contact learning can be told."""
+
+    fit: FitConfig = field(default_factory=FitConfig)
+    sweep: SweepConfig = field(default_factory=SweepConfig)
+    weights: Weights | None = None
+    """None: chosen by held-out rollouts (SweepConfig). `Weights()` are the paper's."""
+    one_toss_dissipation: float = 30.0
+    """Of a single toss, from which nothing can be held out."""
+    bootstrap_repeats: int = 20
+    rollout_steps: int = 80
+    rollout_step_s: float = 1 / 148
+    smooth: bool = True
+    """False: raw differences of the poses."""
+    seed: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class ContactLearning:
+    """What was learned, and all that a reader needs to judge it. Points and shape are in the object frame."""
+
+    model: ContactModel
+    shape: ObjectShape
+    geometry: GeometryName
+    friction: Interval
+    extents: tuple[Interval, ...]
+    spread: Spread
+    weights: Weights
+    sweep: Sweep | None
+    fit: Fit
+    fitted: Model
+    frame: Frame
+    tosses: tuple[int, ...]
+    left_out: Mapping[int, str]
+    duplicates: tuple[tuple[int, ...], ...]
+    transitions: int
+    unexplained: Mapping[int, tuple[int, ...]]
+    solver_failures: int
+    touched: Bool[Array, " v"]
+    plane_sensitivity: Mapping[str, float]
+    checks: Mapping[str, float | None]
+    noise: Mapping[int, tuple[float, float]]
+    cpu_seconds: float
+    seconds: float
+
+    @property
+    def untouched_vertices(self) -> tuple[int, ...]:
+        """Points that no contact ever touched: they are where the prior has them."""
+        return tuple(int(i) for i in np.flatnonzero(~self.touched))
+
+    def body(self) -> Body:
+        """The learned body about the prior's centre of mass, for rollouts."""
+        return self.fitted.numbers(self.fit.parameters)
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """Tosses that can be learned from: about the centre of mass, in a world whose plane is z = 0."""
+
+    tracks: tuple[PoseSeries, ...]
+    smoothed: tuple[Smoothed, ...]
+    left_out: Mapping[int, str]
+
+
+def prepare(
+    tracks: Sequence[PoseSeries], frame: Frame, plane: Plane, inertia: Float[Array, "3 3"]
+) -> Prepared:
+    """Move tracks to the learning frame, check them one by one, smooth them. What cannot be used is left out and named."""
+    level = plane.level_from_world()
+    kept, smoothed, left_out = [], [], {}
+    for track in tracks:
+        try:
+            checks.check_frames(track)
+        except BadInput as wrong:
+            left_out[track.toss] = str(wrong)
+            continue
+        moved = frame.of(track).turned(level, plane.offset_m)
+        kept.append(moved)
+        smoothed.append(smooth(moved, inertia))
+    if not kept:
+        raise BadInput("no toss can be used: " + "; ".join(left_out.values()) if left_out else "no tosses were given")
+    return Prepared(tuple(kept), tuple(smoothed), left_out)
+
+
+def starts(prepared: Prepared) -> tuple[Start, list[int]]:
+    """The smoothed state and the frame each toss is rolled out from: the release (frame 0 where no flight was found)."""
+    begin = [s.phases.release or 0 for s in prepared.smoothed]
+    states = [s.states for s in prepared.smoothed]
+
+    def rows(name: str) -> Float[Array, "n ..."]:
+        return np.stack([getattr(s, name)[b] for s, b in zip(states, begin)])
+
+    start = Start(
+        rows("rotation"), rows("position_m"), rows("spin_object_rad_s"), rows("velocity_world_m_s")
+    )
+    return start, begin
+
+
+def learn_contact(
+    tracks: Sequence[PoseSeries],
+    prior: Prior,
+    physics: Physics,
+    plane: Plane | None = None,
+    config: ContactConfig | None = None,
+    progress: Progress | None = None,
+) -> ContactLearning:
+    """Learn geometry and friction from `world_from_object` tracks.
+
+    Raises BadInput for data that contradict themselves (see data_checks), for no contact, and for learning plane and size.
+    """
+    began = time.perf_counter()
+    plane, config, progress = plane or Plane(), config or ContactConfig(), progress or Silent()
+    inertia = REFERENCE_MASS_KG / physics.mass_kg * prior.frame.inertia(physics.inertia_kgm2)
+    fitted = Model(prior.geometry, inertia, config.fit)
+    groups = checks.duplicate_groups(tracks)
+    again = {t for group in groups for t in group[1:]}
+    prepared = prepare([t for t in tracks if t.toss not in again], prior.frame, plane, inertia)
+    found = _check_together(tracks, prepared, prior, inertia, fitted)
+    steps = _steps(prepared, config)
+    _require_contact(fitted, steps, prepared)
+    progress.step(1, 6, "data checked")
+    sweep, weights = _choose_weights(fitted, steps, prepared, config, progress)
+    data = StepData(steps, config.fit.device)
+    started = time.process_time()
+    fits = [fit(fitted, fitted.start(), data, weights)]
+    odd = unexplained_rows(data, fitted.numbers(fits[0].parameters), prior.geometry.contacts)
+    if bool(odd.any()):
+        data.weight[odd] = 0.0
+        fits.append(fit(fitted, fits[0].parameters, data, weights))
+    cpu_seconds = time.process_time() - started
+    progress.step(3, 6, "fitted")
+    optimum = fits[-1].parameters
+    spread = _spread(fitted, optimum, data, weights, config, len(prepared.tracks))
+    progress.step(4, 6, "intervals")
+    sensitivity = plane_sensitivity(fitted, optimum, data, weights)
+    progress.step(5, 6, "sensitivity")
+    body = fitted.numbers(optimum)
+    touched = touched_points(fitted, body, data, weights)
+    _check_learned_plane(prepared, body)
+    model, shape, friction, sizes = _results(fitted, optimum, spread, prior, physics, plane, touched)
+    left_out = {**prepared.left_out, **{t: "the same recording as another toss" for t in sorted(again)}}
+    progress.step(6, 6, "learned")
+    return ContactLearning(
+        model=model,
+        shape=shape,
+        geometry=prior.geometry.name,
+        friction=friction,
+        extents=sizes,
+        spread=spread,
+        weights=weights,
+        sweep=sweep,
+        fit=fits[-1],
+        fitted=fitted,
+        frame=prior.frame,
+        tosses=tuple(t.toss for t in prepared.tracks),
+        left_out=left_out,
+        duplicates=tuple(groups),
+        transitions=len(steps),
+        unexplained=_by_toss(steps, odd.cpu().numpy()),
+        solver_failures=fits[-1].last_failures,
+        touched=touched,
+        plane_sensitivity=sensitivity,
+        checks=found,
+        noise={s.states.toss: (s.noise.position_m, s.noise.rotation_rad) for s in prepared.smoothed},
+        cpu_seconds=cpu_seconds,
+        seconds=time.perf_counter() - began,
+    )
+
+
+def _check_together(
+    tracks: Sequence[PoseSeries], prepared: Prepared, prior: Prior, inertia: Float[Array, "3 3"], fitted: Model
+) -> dict[str, float | None]:
+    """Checks over all usable tosses; what they measured goes into the result."""
+    usable = {t.toss for t in prepared.tracks}
+    checks.check_velocities([t for t in tracks if t.toss in usable])
+    fall = checks.check_fall(prepared.tracks)
+    angle = checks.check_orientations(prepared.tracks, inertia)
+    height = None
+    if prior.measured:
+        points = fitted.numbers(fitted.start()).points_m.cpu().numpy()
+        height = checks.check_plane(_rest_heights(prepared, points), "the prior shape")
+    return {"fall_m_s2": fall, "impact_misfit": angle, "prior_rest_height_m": height}
+
+
+def _rest_heights(prepared: Prepared, points_m: Float[Array, "v 3"]) -> dict[int, float]:
+    found = {}
+    for track, smoothed in zip(prepared.tracks, prepared.smoothed):
+        height = checks.lowest_point_m(track, points_m, smoothed.phases)
+        if height is not None:
+            found[track.toss] = height
+    return found
+
+
+def _check_learned_plane(prepared: Prepared, body: Body) -> None:
+    points = body.points_m.cpu().numpy() - np.array([0.0, 0.0, 0.0])
+    checks.check_plane(_rest_heights(prepared, points), "the learned shape")
+
+
+def _steps(prepared: Prepared, config: ContactConfig) -> Steps:
+    """Transitions from the release on: what a hand does is not learned."""
+    from processing.contact.motion import differences
+
+    states = [
+        s.states if config.smooth else differences(t) for t, s in zip(prepared.tracks, prepared.smoothed)
+    ]
+    steps = steps_of(states)
+    release = {s.states.toss: s.phases.release or 0 for s in prepared.smoothed}
+    begin = np.array([release[t] for t in steps.toss.tolist()])
+    return steps.only(steps.frame >= begin + 2)
+
+
+def _require_contact(fitted: Model, steps: Steps, prepared: Prepared) -> None:
+    """Raises BadInput where flight explains everything."""
+    touching = [s for s in prepared.smoothed if not s.phases.in_flight.all()]
+    if len(steps) == 0 or not touching:
+        raise BadInput(
+            f"no contact in the data: free flight explains all {len(steps)} transitions of {len(prepared.tracks)} tosses; "
+            "wanted tosses that are recorded until the object has hit the plane"
+        )
+
+
+def _choose_weights(
+    fitted: Model, steps: Steps, prepared: Prepared, config: ContactConfig, progress: Progress
+) -> tuple[Sweep | None, Weights]:
+    if config.weights is not None:
+        return None, config.weights
+    if len(prepared.tracks) < 3:
+        return None, Weights(dissipation=config.one_toss_dissipation)
+    start, begin = starts(prepared)
+    held_out = HeldOut(prepared.tracks, start, begin, config.rollout_steps, config.rollout_step_s)
+    sweep = sweep_weights(
+        fitted, steps, held_out, config.sweep, lambda done, total: progress.step(1, 6, f"weights {done}/{total}")
+    )
+    return sweep, Weights(dissipation=sweep.chosen.dissipation)
+
+
+def _spread(
+    fitted: Model,
+    optimum: Float[Array, " p"],
+    data: StepData,
+    weights: Weights,
+    config: ContactConfig,
+    tosses: int,
+) -> Spread:
+    if tosses < 2 or config.bootstrap_repeats < 2:
+        return curvature(fitted, optimum, data, weights)
+    return bootstrap(fitted, optimum, data, weights, config.bootstrap_repeats, config.seed)
+
+
+def plane_sensitivity(
+    fitted: Model, optimum: Float[Array, " p"], data: StepData, weights: Weights, shift_m: float = 0.001
+) -> dict[str, float]:
+    """What the learned numbers do when the plane is 1 mm higher: metres (or friction) per metre."""
+    low = data.rows(torch.arange(len(data), device=data.weight.device))
+    low.position_m = data.position_m - data.position_m.new_tensor([0.0, 0.0, shift_m])
+    moved = fit(fitted, optimum, low, weights, 0.3).parameters
+
+    def size(parameters: Float[Array, " p"]) -> Float[Array, "3"]:
+        return extents(fitted.numbers(parameters).points_m.cpu().numpy())
+
+    change = (size(moved) - size(optimum)) / shift_m
+    friction = float(moved[FRICTION] ** 2 - optimum[FRICTION] ** 2) / shift_m
+    return {
+        "mean_extent_m_per_m": float(change.mean()),
+        "largest_extent_m_per_m": float(change[np.abs(change).argmax()]),
+        "friction_per_m": friction,
+    }
+
+
+def touched_points(fitted: Model, body: Body, data: StepData, weights: Weights) -> Bool[Array, " v"]:
+    """Points that carried an impulse, or were pushed out of the plane, in some transition that was learned from."""
+    from processing.contact.loss import find_contacts
+
+    impulses = contact_loss(data, body, fitted.geometry.contacts, weights).impulses
+    found = find_contacts(data.rotation, data.position_m, body, fitted.geometry.contacts)
+    carried = torch.zeros_like(found.height_m, dtype=torch.bool)
+    carried[impulses.rows] = impulses.impulse[..., 2] > 1e-6
+    learned = (carried | (found.height_m < 0)) & (data.weight > 0)[:, None]
+    touched = np.zeros(len(body.points_m), dtype=bool)
+    touched[found.index[learned].cpu().numpy()] = True
+    return touched
+
+
+def _by_toss(steps: Steps, odd: Bool[Array, " n"]) -> dict[int, tuple[int, ...]]:
+    """Frames of the transitions that were left out, by toss."""
+    found: dict[int, list[int]] = {}
+    for toss, frame in zip(steps.toss[odd].tolist(), steps.frame[odd].tolist()):
+        found.setdefault(toss, []).append(frame)
+    return {toss: tuple(frames) for toss, frames in found.items()}
+
+
+def _results(
+    fitted: Model,
+    optimum: Float[Array, " p"],
+    spread: Spread,
+    prior: Prior,
+    physics: Physics,
+    plane: Plane,
+    touched: Bool[Array, " v"],
+) -> tuple[ContactModel, ObjectShape, Interval, tuple[Interval, ...]]:
+    body = fitted.numbers(optimum)
+    points = body.points_m.cpu().numpy()
+    mu = float(body.friction)
+    friction = Interval(mu, max(mu - spread.friction, 0.0), mu + spread.friction)
+    sizes = tuple(
+        Interval(float(x), float(max(x - w, 0.0)), float(x + w)) for x, w in zip(extents(points), spread.extents_m)
+    )
+    frame = prior.frame
+    inertia = physics.mass_kg / REFERENCE_MASS_KG * body.inertia_kgm2.cpu().numpy()
+    model = ContactModel(
+        object_frame=prior.object_frame,
+        support_vertices_m=frame.back(points),
+        pieces=prior.geometry.pieces(),
+        friction=mu,
+        friction_low=friction.low,
+        friction_high=friction.high,
+        mass_kg=physics.mass_kg,
+        inertia_kgm2=frame.axes @ inertia @ frame.axes.T,
+        center_of_mass_m=frame.back(body.center_m.cpu().numpy()[None])[0],
+        physics_source=physics.source,
+        plane_normal_world=np.asarray(plane.normal_world, dtype=np.float64),
+        plane_offset_m=plane.offset_m,
+    )
+    return model, learned_shape(prior, points, touched), friction, sizes
