@@ -17,6 +17,8 @@ ABOUT = "about"
 EYE_FROM_TARGET = np.array([1.0, -0.75, 0.6])
 """Where the first look comes from, in world axes: from the right, behind the colour camera's shoulder, from above."""
 ELBOW_M = np.array([0.0, 0.0, 0.7])
+HALF_VIEW = 0.55
+"""Tangent of the half angle that must hold everything; the eye sees a little more."""
 SLOW = 0.25
 
 
@@ -53,42 +55,46 @@ def _space(scene: Scene) -> rrb.Spatial3DView:
     overrides = {path: rrb.EntityBehavior(visible=False) for path in paths}
     if scene.root != "world":
         return rrb.Spatial3DView(origin="world", name=f"As seen from {scene.root}", overrides=overrides)
-    target = centre_m(scene)
+    position, target = first_look(scene)
     grid = rrb.LineGrid3D(visible=True, spacing=0.1, color=[120, 120, 120, 90], stroke_width=1.0)
-    eye = rrb.EyeControls3D(
-        position=target + EYE_FROM_TARGET * reach_m(scene, target), look_target=target, eye_up=[0, 0, 1]
-    )
+    eye = rrb.EyeControls3D(position=position, look_target=target, eye_up=[0, 0, 1])
     return rrb.Spatial3DView(
         origin="world", name="The table in 3D", overrides=overrides, line_grid=grid, eye_controls=eye
     )
 
 
-def centre_m(scene: Scene) -> Float[Array, "3"]:
-    """What the first look is at: between the middle of the first toss's motion and the middle of the devices."""
-    moved = np.array([0.0, 0.0, 0.1])
+def first_look(scene: Scene) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+    """Where the eye stands and what it looks at, so that the devices, the tags and the first toss's motion fit in."""
+    points = np.vstack(
+        [device_places_m(scene), *(t.world_from_tag.translation_m for t in scene.calibration.table_tags)]
+    )
+    moved = motion_m(scene)
+    seen = np.vstack([points, moved if len(moved) else [[0.0, 0.0, 0.1]]])
+    target = (seen.min(axis=0) + seen.max(axis=0)) / 2
+    along = EYE_FROM_TARGET / np.linalg.norm(EYE_FROM_TARGET)
+    nearer = (seen - target) @ along
+    aside = np.linalg.norm(seen - target - nearer[:, None] * along, axis=1)
+    distance_m = float((nearer + aside / HALF_VIEW).max())
+    return target + along * float(np.clip(distance_m, 0.6, 6.0)), target
+
+
+def motion_m(scene: Scene) -> Float[Array, "n 3"]:
+    """Where the object was in the first toss, by the first body that knows."""
     for body in scene.bodies:
         _, matrices = root_poses(scene, body.poses.get(scene.tosses[0], ()))
         known = matrices[np.isfinite(matrices).all(axis=(1, 2)), :3, 3]
         if len(known):
-            moved = (known.min(axis=0) + known.max(axis=0)) / 2
-            break
-    devices = device_places_m(scene)
-    return moved + 0.35 * (devices.mean(axis=0) - moved) if len(devices) else moved
-
-
-def reach_m(scene: Scene, target: Float[Array, "3"]) -> float:
-    """How far the look stands back, so that every device fits in."""
-    far = np.linalg.norm(device_places_m(scene) - target, axis=1)
-    return float(np.clip(far.max(initial=0.5) * 1.5, 0.8, 4.0))
+            return known
+    return np.zeros((0, 3))
 
 
 def device_places_m(scene: Scene) -> Float[Array, "n 3"]:
-    """Where the cameras are and, for an arm, where its elbow may be, in the root frame."""
+    """Where the cameras are and, for an arm, where its foot and its elbow are, in the root frame."""
     frames = [scene.root_from(camera.frame) for camera in scene.calibration.cameras.values()]
     places = [frame.translation_m for frame in frames if frame is not None]
     root_from_base = scene.root_from(BASE)
     if root_from_base is not None:
-        places.append(root_from_base.translation_m + ELBOW_M)
+        places += [root_from_base.translation_m, root_from_base.translation_m + ELBOW_M]
     return np.array(places, dtype=np.float64).reshape(-1, 3)
 
 
