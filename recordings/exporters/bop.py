@@ -107,7 +107,9 @@ def _write_scene(folder: Path, session: Session, toss: Toss, track: ObjectTrack,
         raise BadInput(
             f"toss {toss.index}: {len(colors)} images, {len(track.time_ns)} poses; the session was changed since"
         )
-    cameras, poses, lines = {}, {}, []
+    cameras: dict[str, Any] = {}
+    poses: dict[str, list[dict[str, Any]]] = {}
+    lines = []
     for i, (image, (raw, scale)) in enumerate(zip(colors, _Depths(toss), strict=True)):
         suffix, data = image_file(image)
         (scene / "rgb" / f"{i:06d}{suffix}").write_bytes(data)

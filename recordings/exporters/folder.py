@@ -53,9 +53,13 @@ def export_folder(
 def _document(session: Session) -> dict[str, Any]:
     imported = session.start.get("import") or {}
     document = dict(imported.get("document") or {}) if imported.get("layout") == "folder" else {}
-    document.setdefault("object", session.object_name)
-    document.setdefault("world", "z up, table top is the plane z = 0, metres")
-    document.setdefault("camera_frame", "OpenCV: x right, y down, z forward")
+    if not document:
+        document = {
+            "object": session.object_name,
+            "world": "z up, table top is the plane z = 0, metres",
+            "camera_frame": "OpenCV: x right, y down, z forward",
+            "arm": (session.start.get("rig") or {}).get("arm"),
+        }
     calibration = session.calibration
     camera = _camera(calibration.camera(CAMERA), document.get("camera") or {})
     camera |= {"depth_unit_m": _depth_unit(session), "depth_invalid": 0}

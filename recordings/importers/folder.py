@@ -128,7 +128,7 @@ def _list_toss(folder: Path, number: int, layout: Layout, warnings: Warnings) ->
     about = common.read_json_object(folder / "toss.json") if (folder / "toss.json").exists() else {}
     if about.get("frames") not in (None, len(color)):
         warnings.add(f"{folder.name}: toss.json says {about['frames']} frames, {len(color)} colour images are there")
-    arm = _read_arm(folder / "arm.csv", str(layout.document.get("arm", "franka_panda")))
+    arm = _read_arm(folder / "arm.csv", str(layout.document.get("arm") or "franka_panda"))
     return _Toss(number, folder, color, color_ns, depth, depth_ns, mono, arm, about)
 
 
