@@ -89,7 +89,7 @@ def _same_heights(a: States, b: States) -> bool:
     return bool(np.abs(a.position_m[:n, 2] - b.position_m[:n, 2]).max() <= SAME_Z_M)
 
 
-def _median(parts: list[Float[Array, " n"]]) -> float | None:
+def _median(parts: list[Array]) -> float | None:
     joined = np.concatenate(parts) if parts else np.zeros(0)
     return float(np.median(joined)) if len(joined) else None
 
