@@ -48,10 +48,9 @@ def draw_release(config: SceneConfig, radius_m: float, rng: np.random.Generator)
 def brightness_course(config: SceneConfig, toss: int, times_s: Float[Array, " n"]) -> Float[Array, " n"]:
     """Brightness of each frame against the first exposure setting: slow waves, `drift` at the most."""
     rng = generator(config.seed, COLOR, toss)
-    wave = sum(
-        np.sin(2 * np.pi * times_s / rng.uniform(*periods) + rng.uniform(0, 2 * np.pi))
-        for periods in ((1.0, 2.5), (0.6, 1.2))
-    )
+    wave = np.zeros_like(times_s)
+    for shortest_s, longest_s in ((1.0, 2.5), (0.6, 1.2)):
+        wave += np.sin(2 * np.pi * times_s / rng.uniform(shortest_s, longest_s) + rng.uniform(0, 2 * np.pi))
     return 1 + config.color.drift * wave / max(float(np.abs(wave).max()), 1e-9)
 
 

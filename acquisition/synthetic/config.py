@@ -193,5 +193,7 @@ class SceneConfig:
     errors: ErrorConfig = field(default_factory=ErrorConfig)
     table: TableStyle = "wood"
     table_tags: bool = True
+    still_rays: int = 6_400_000
+    """Rays spent on a camera's picture of the room: 4 a pixel at 1440x1080 (at least 1, at most 16)."""
     say_release: bool = True
     """Write release_time_s into toss.json."""

@@ -217,7 +217,7 @@ def _write_truth_poses(lab: Lab, toss: SyntheticToss, there: Path) -> None:
     released = int(np.searchsorted(motion.times_s, toss.motion.free_s - 1e-9))
     world = np.array([f.world_from_object.matrix for f in toss.frames])
     swing = toss.motion.swing
-    tool = {}
+    tool: dict[str, Any] = {}
     if lab.arm is not None and swing is not None:
         tool["T_world_tcp"] = np.array([lab.arm.world_from_tool(swing.q_rad(t)).matrix for t in times])
     np.savez_compressed(

@@ -45,9 +45,7 @@ MIDDLE_GREY = 0.2
 """Mean linear level of a well exposed picture."""
 BRIGHTEST = 0.95
 """Level that white paper reaches at the most."""
-STILL_RAYS = 3_200_000
-"""Rays spent on a still picture: 10 a pixel at 640x480."""
-STILL_SAMPLES = (4, 16)
+STILL_SAMPLES = (1, 16)
 """Fewest and most rays a pixel."""
 
 
@@ -123,7 +121,7 @@ class Lab:
         return min(MIDDLE_GREY / float(still.radiance.mean()), BRIGHTEST / whitest)
 
     def _still_of(self, view: View, number: int) -> StillPicture:
-        samples = int(np.clip(STILL_RAYS / (view.camera.width * view.camera.height), *STILL_SAMPLES))
+        samples = int(np.clip(self.config.still_rays / (view.camera.width * view.camera.height), *STILL_SAMPLES))
         return still_picture(view, self.room, self.light, generator(self.config.seed, STILL, number), samples)
 
     def plan(self, toss: int) -> Motion:

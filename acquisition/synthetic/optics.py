@@ -176,7 +176,8 @@ def still_picture(view: View, room: Standing, light: Light, rng: np.random.Gener
         for band in _bands(shape[1], shape[0]):
             for total, part in zip(parts, _still_band(view, room, light, lamps, view.jittered(band, dx, dy))):
                 total[band.slices] += part.reshape(total[band.slices].shape) / np.float32(samples)
-    return StillPicture(*parts, *_geometry(view, room))
+    points, z, facing = _geometry(view, room)
+    return StillPicture(parts[0], parts[1], parts[2], points, z, facing)
 
 
 def _bands(width: int, height: int) -> Iterator[Box]:

@@ -60,7 +60,8 @@ def paint_object(solid: Solid, surface: Surface, rng: np.random.Generator) -> tu
     """Paint every chart of an object in one manner; `tagged` puts a tag on each flat chart with room for one."""
     scale = _texels_per_m(solid)
     base = _base_color(surface, rng)
-    pictures, tags = [], []
+    pictures: list[Array] = []
+    tags: list[ObjectTag] = []
     for number, chart in enumerate(solid.charts):
         width, height = _pixels(chart, scale)
         picture = _picture(surface, rng, height, width, base)

@@ -114,7 +114,7 @@ class DepthSensor:
 
     def _grain(self, rng: np.random.Generator, shape: tuple[int, int]) -> Float32[Array, "h w"]:
         fine = _smooth(rng, shape, 1.4 * self._scale) * self.config.fine_sigma_px
-        return fine + _smooth(rng, shape, 20 * self._scale) * self.config.coarse_sigma_px
+        return fine + _smooth(rng, shape, 20.0 * self._scale) * self.config.coarse_sigma_px
 
     def _shadow(self, disparity: Float32[Array, "h w"]) -> Bool[Array, "h w"]:
         """What the pair's other eye, to the right, cannot see: something nearer lies in the way."""

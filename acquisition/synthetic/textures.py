@@ -32,7 +32,7 @@ def rich(rng: np.random.Generator, height: int, width: int) -> Float32[Array, "h
     picture = np.zeros((height, width, 3), np.float32) + color(rng)
     for cell, strength in ((size / 3, 0.5), (size / 8, 0.4), (size / 24, 0.35)):
         for channel in range(3):
-            picture[..., channel] += strength * (noise(rng, height, width, max(cell, 2)) - 0.5)
+            picture[..., channel] += strength * (noise(rng, height, width, max(cell, 2.0)) - 0.5)
     picture = np.ascontiguousarray(np.clip(picture, 0.02, 0.95))
     for _ in range(10):
         _shape(rng, picture)
@@ -56,7 +56,7 @@ def few(rng: np.random.Generator, height: int, width: int, base: Float32[Array, 
 
 def plain(rng: np.random.Generator, height: int, width: int, base: Float32[Array, "3"]) -> Float32[Array, "h w 3"]:
     """One colour with the faint unevenness that real surfaces have (about 3 %)."""
-    uneven = 0.97 + 0.04 * noise(rng, height, width, 40) + 0.02 * noise(rng, height, width, 6)
+    uneven = 0.97 + 0.04 * noise(rng, height, width, 40.0) + 0.02 * noise(rng, height, width, 6.0)
     return np.clip(uneven[..., None] * base, 0, 1).astype(np.float32)
 
 
@@ -78,7 +78,7 @@ def wood(rng: np.random.Generator, height: int, width: int) -> Float32[Array, "h
 
 def speckled(rng: np.random.Generator, height: int, width: int) -> Float32[Array, "h w 3"]:
     """A laminate with grains of two scales."""
-    fine, coarse = noise(rng, height, width, 3), noise(rng, height, width, 9)
+    fine, coarse = noise(rng, height, width, 3.0), noise(rng, height, width, 9.0)
     base = color(rng, 0.25, 0.6) * 0.3 + 0.25
     picture = base * (0.75 + 0.5 * fine[..., None]) + 0.12 * (coarse[..., None] > 0.72)
     return np.clip(picture, 0.02, 0.9).astype(np.float32)
@@ -87,7 +87,7 @@ def speckled(rng: np.random.Generator, height: int, width: int) -> Float32[Array
 def faint(rng: np.random.Generator, height: int, width: int) -> Float32[Array, "h w 3"]:
     """A nearly plain table top."""
     return plain(rng, height, width, np.full(3, rng.uniform(0.3, 0.6), np.float32)) * (
-        0.94 + 0.12 * noise(rng, height, width, 180)[..., None]
+        0.94 + 0.12 * noise(rng, height, width, 180.0)[..., None]
     )
 
 
