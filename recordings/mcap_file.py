@@ -35,6 +35,7 @@ CACHED_CHUNKS = 4
 MAX_CHUNK_BYTES = 1 << 30
 _MESSAGE_HEAD = struct.Struct("<BQHIQQ")
 _CHUNK_HEAD = struct.Struct("<BQQQQI")
+_INDEX_HEAD = struct.Struct("<BQHI")
 RAISED = (
     McapError,
     ValueError,
@@ -76,7 +77,7 @@ class McapFile:
             raise BadInput(f"{path} cannot be opened: {refused.strerror}") from refused
         self._check_ends()
         self.summary: Summary = self._guard(self._read_summary, "its index")
-        self._cache: OrderedDict[int, bytes] = OrderedDict()
+        self._cache: OrderedDict[int, bytes | memoryview] = OrderedDict()
 
     def __enter__(self) -> McapFile:
         return self
@@ -117,9 +118,7 @@ class McapFile:
         """Where every message of a topic lies, in the order of log time. Empty for a topic that is not there."""
         if topic not in self.channels:
             return TopicIndex.empty()
-        if topic not in self._indexes:
-            self._indexes[topic] = self._guard(lambda: self._read_index(self._ids[topic]), f"the index of {topic}")
-        return self._indexes[topic]
+        return self._indexes.get(topic, TopicIndex.empty())
 
     def read(self, topic: str, position: int) -> Message:
         """The message at a position (0-based, log-time order) of a topic. Raises IndexError behind the last one."""
@@ -172,7 +171,7 @@ class McapFile:
 
     @cached_property
     def _indexes(self) -> dict[str, TopicIndex]:
-        return {}
+        return self._guard(self._read_indexes, "its message index")
 
     def _guard(self, read: Callable[[], T], what: str) -> T:
         try:
@@ -212,29 +211,20 @@ class McapFile:
                 raise ValueError(f"topic {channel.topic} names a schema that is not there")
         return summary
 
-    def _read_index(self, channels: frozenset[int]) -> TopicIndex:
-        times, chunks, offsets = [], [], []
+    def _read_indexes(self) -> dict[str, TopicIndex]:
+        """Of every topic, with one read per chunk."""
+        topics = {number: topic for topic, numbers in self._ids.items() for number in numbers}
+        tables: dict[str, list[Array]] = {}
         for number, chunk in enumerate(self.summary.chunk_indexes):
-            for place in (p for c, p in chunk.message_index_offsets.items() if c in channels):
-                table = self._message_index(place, chunk.uncompressed_size)
-                times.append(table[:, 0])
-                offsets.append(table[:, 1])
-                chunks.append(np.full(len(table), number, dtype=np.int64))
-        if not times:
-            return TopicIndex.empty()
-        joined = np.concatenate(times)
-        order = np.argsort(joined, kind="stable")
-        return TopicIndex(joined[order], np.concatenate(chunks)[order], np.concatenate(offsets)[order])
-
-    def _message_index(self, place: int, chunk_size: int) -> Int64[Array, "n 2"]:
-        """Log time and offset of each message."""
-        opcode, length, _, size = struct.unpack("<BQHI", self._exactly(place, 15))
-        if opcode != Opcode.MESSAGE_INDEX or size != length - 6 or size % 16:
-            raise ValueError("a message index record is malformed")
-        table = np.frombuffer(self._exactly(place + 15, size), dtype="<i8").reshape(-1, 2)
-        if len(table) and (table.min() < 0 or table[:, 1].max() + _MESSAGE_HEAD.size > chunk_size):
-            raise ValueError("a message index points out of its chunk")
-        return table
+            start = chunk.chunk_start_offset + chunk.chunk_length
+            block = self._exactly(start, chunk.message_index_length)
+            for channel, place in chunk.message_index_offsets.items():
+                if channel in topics:
+                    table = _message_index(block, place - start, chunk.uncompressed_size)
+                    numbered = np.empty((len(table), 3), dtype=np.int64)
+                    numbered[:, 0], numbered[:, 1], numbered[:, 2] = table[:, 0], number, table[:, 1]
+                    tables.setdefault(topics[channel], []).append(numbered)
+        return {topic: TopicIndex.of(np.concatenate(found)) for topic, found in tables.items()}
 
     def _record(self, offset: int, kind: type[T]) -> T:
         length = struct.unpack("<Q", self._exactly(offset + 1, 8))[0]
@@ -255,7 +245,7 @@ class McapFile:
         chunk = self.summary.chunk_indexes[number]
         return chunk, chunk.chunk_start_offset + _CHUNK_HEAD.size + 4 + len(chunk.compression.encode()) + 8
 
-    def _chunk(self, number: int) -> bytes:
+    def _chunk(self, number: int) -> bytes | memoryview:
         if number in self._cache:
             self._cache.move_to_end(number)
             return self._cache[number]
@@ -265,13 +255,13 @@ class McapFile:
             self._cache.popitem(last=False)
         return data
 
-    def _load_chunk(self, number: int) -> bytes:
+    def _load_chunk(self, number: int) -> bytes | memoryview:
         chunk, place = self._chunk_place(number)
-        head = self._exactly(chunk.chunk_start_offset, place - chunk.chunk_start_offset)
-        opcode, _, _, _, size, crc = _CHUNK_HEAD.unpack(head[: _CHUNK_HEAD.size])
+        whole = self._exactly(chunk.chunk_start_offset, place - chunk.chunk_start_offset + chunk.compressed_size)
+        opcode, _, _, _, size, crc = _CHUNK_HEAD.unpack_from(whole)
         if opcode != Opcode.CHUNK or size != chunk.uncompressed_size or size > MAX_CHUNK_BYTES:
             raise ValueError("the chunk's head and its index disagree")
-        data = decompress(chunk.compression, self._exactly(place, chunk.compressed_size), size)
+        data = decompress(chunk.compression, memoryview(whole)[place - chunk.chunk_start_offset :], size)
         if crc and zlib.crc32(data) != crc:
             raise ValueError("the chunk's CRC differs")
         return data
@@ -288,12 +278,12 @@ class McapFile:
             raise ValueError(f"opcode {head[0]}, time {head[5]}")
         return int(head[5])
 
-    def _cut(self, topic: str, chunk: bytes, offset: int) -> Message:
+    def _cut(self, topic: str, chunk: bytes | memoryview, offset: int) -> Message:
         opcode, length, channel, sequence, log_ns, publish_ns = _MESSAGE_HEAD.unpack_from(chunk, offset)
         end = offset + 9 + length
         if opcode != Opcode.MESSAGE or channel not in self._ids[topic] or end > len(chunk) or length < 22:
             raise ValueError("its index points to something else")
-        return Message(topic, sequence, log_ns, publish_ns, chunk[offset + _MESSAGE_HEAD.size : end])
+        return Message(topic, sequence, log_ns, publish_ns, bytes(chunk[offset + _MESSAGE_HEAD.size : end]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -308,9 +298,28 @@ class TopicIndex:
         return len(self.log_time_ns)
 
     @staticmethod
+    def of(table: Int64[Array, "n 3"]) -> TopicIndex:
+        """From rows of (log time, chunk, offset) in any order."""
+        order = np.argsort(table[:, 0], kind="stable")
+        return TopicIndex(table[order, 0], table[order, 1], table[order, 2])
+
+    @staticmethod
     def empty() -> TopicIndex:
         none = np.zeros(0, dtype=np.int64)
         return TopicIndex(none, none, none)
+
+
+def _message_index(block: bytes, place: int, chunk_size: int) -> Int64[Array, "n 2"]:
+    """Log time and offset of each message, from a message index record at `place` of a block."""
+    if not 0 <= place <= len(block) - _INDEX_HEAD.size:
+        raise ValueError("a message index lies elsewhere than behind its chunk")
+    opcode, length, _, size = _INDEX_HEAD.unpack_from(block, place)
+    if opcode != Opcode.MESSAGE_INDEX or size != length - 6 or size % 16 or place + 15 + size > len(block):
+        raise ValueError("a message index record is malformed")
+    table = np.frombuffer(block, dtype="<i8", count=size // 8, offset=place + _INDEX_HEAD.size).reshape(-1, 2)
+    if len(table) and (table.min() < 0 or table[:, 1].max() + _MESSAGE_HEAD.size > chunk_size):
+        raise ValueError("a message index points out of its chunk")
+    return table
 
 
 def _parse_summary(block: bytes) -> Summary:
@@ -333,13 +342,13 @@ def _parse_summary(block: bytes) -> Summary:
     return summary
 
 
-def decompress(compression: str, data: bytes, size: int) -> bytes:
+def decompress(compression: str, data: bytes | memoryview, size: int) -> bytes | memoryview:
     """The raw bytes of a chunk. Raises ValueError when they are not `size` bytes or the compression is unknown."""
     if size > MAX_CHUNK_BYTES:
         raise ValueError(f"a chunk of {size} bytes")
     try:
         if compression == "":
-            raw = data
+            raw: bytes | memoryview = data
         elif compression == "zstd":
             if zstandard.frame_content_size(data) not in (-1, size):
                 raise ValueError("the chunk's head and its content disagree in size")

@@ -141,7 +141,7 @@ def parse_chunk(record: Record) -> Chunk:
         raise ValueError(f"a chunk with a malformed head ({wrong})") from wrong
     if data_at + data_length != len(body):
         raise ValueError(f"a chunk of {len(body)} bytes whose head says {data_at + data_length}")
-    raw = decompress(name, body[data_at:], size)
+    raw = bytes(decompress(name, body[data_at:], size))
     if crc and zlib.crc32(raw) != crc:
         raise ValueError("a chunk that differs from its CRC")
     return Chunk(first_ns, last_ns, crc, name, data_length, raw)

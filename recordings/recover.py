@@ -157,6 +157,10 @@ class _Rewriting:
             notes.append(
                 "the file's own counts are gone: what its last, open chunk held (at most 1 MiB or 250 ms) is unknown"
             )
+        if self.found.loose_messages:
+            notes.append(
+                f"{self.found.loose_messages} messages lay outside of chunks, without a CRC that would tell alterations"
+            )
         return Recovered(
             str(self.source.name),
             str(self.writer.path.name),

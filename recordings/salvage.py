@@ -43,6 +43,7 @@ class Survey:
     channels: dict[int, Channel] = field(default_factory=dict)
     lost: dict[int, int] = field(default_factory=dict)
     stated: dict[int, int] = field(default_factory=dict)
+    loose_messages: int = 0
     damage: list[tuple[int, int, str]] = field(default_factory=list)
 
     @property
@@ -81,6 +82,7 @@ class _Walk:
         self.after_bad_chunk = False
         self.found_again = False
         self.lost_track = False
+        self.proved = True
         self.statistics: Statistics | None = None
         self.doubtful: dict[type, dict[int, Schema] | dict[int, Channel]] = {Schema: {}, Channel: {}}
 
@@ -94,6 +96,7 @@ class _Walk:
         if not self.found.whole_ending and not self._ends_in_damage():
             self.found.damage.append((self.file.size, self.file.size, "the file ends without its index"))
         self._definitions()
+        self.found.loose_messages = self.messages
         return self.found
 
     def _without_mark(self) -> int:
@@ -118,6 +121,8 @@ class _Walk:
             self.after_bad_chunk = record.opcode == Opcode.CHUNK
             return self._behind(record, str(wrong))
         self.found_again = False
+        if record.opcode not in (Opcode.SCHEMA, Opcode.CHANNEL):
+            self.proved = True
         return record.end
 
     def _behind(self, record: Record, what: str) -> int:
@@ -127,13 +132,20 @@ class _Walk:
             mcap_scan.record_at(self.file, record.end)
         except ValueError:
             return self._skip(record.offset, what)
-        self.found.damage.append((record.offset, record.end, what))
+        self._damaged(record.offset, record.end, what)
         return record.end
+
+    def _damaged(self, start: int, end: int, what: str) -> None:
+        """Definitions alone do not end a damaged place: they are found inside a chunk that was cut off, too."""
+        if self.found.damage and not self.proved:
+            start, _, what = self.found.damage.pop()
+        self.found.damage.append((start, end, what))
+        self.proved = False
 
     def _skip(self, offset: int, what: str, from_byte: int | None = None) -> int:
         begin = offset + 1 if from_byte is None else from_byte
         end = mcap_scan.find_again(self.file, begin, loose_messages=self.chunks == 0 and self.messages > 0)
-        self.found.damage.append((offset, end, what))
+        self._damaged(offset, end, what)
         self.found_again = self.lost_track = True
         return end
 

@@ -1,0 +1,440 @@
+"""The session's figures, each beside what was wanted and beside a plain mcap loop in the same run.
+
+python tools/bench_session.py            # all, about five minutes
+python tools/bench_session.py --quick    # shorter recordings, a smaller file, fewer kills
+python tools/bench_session.py write      # one of: codec write read info kill
+
+CPU seconds are of the whole process with all its threads. The 20,000 mutations are tests/recordings/test_fuzz.py.
+"""
+
+from __future__ import annotations
+
+import argparse
+import multiprocessing
+import os
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT))
+
+from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage  # noqa: E402
+from foxglove_schemas_protobuf.JointStates_pb2 import JointStates  # noqa: E402
+from foxglove_schemas_protobuf.RawImage_pb2 import RawImage  # noqa: E402
+from mcap.reader import make_reader  # noqa: E402
+from mcap.writer import Writer as PlainWriter  # noqa: E402
+
+from recordings.codec import decode_image, schema_descriptor  # noqa: E402
+from recordings.depth_codec import pack_depth, unpack_depth  # noqa: E402
+from recordings.geometry import CameraModel  # noqa: E402
+from recordings.mcap_writer import CHUNK_BYTES, CHUNK_NS  # noqa: E402
+from recordings.records import ArmStates, DepthImage, EncodedImage  # noqa: E402
+from recordings.recover_session import recover  # noqa: E402
+from recordings.schemas.tosslab_pb2 import DepthImage as DepthMessage  # noqa: E402
+from recordings.session import Session  # noqa: E402
+from recordings.session_writer import SessionWriter, TossWriter  # noqa: E402
+from recordings.tracks import RigCalibration  # noqa: E402
+
+DATA = Path(os.environ.get("TOSSLAB_DATA", ROOT.parent / "shared" / "data"))
+FPS, MONOS, MONO_SIZE, ARM_HZ = 30, ("mono0", "mono1", "mono2"), (1440, 1080), 1000
+POOL = 12
+JPEG = [cv2.IMWRITE_JPEG_QUALITY, 95]
+JOINTS = tuple(f"panda_joint{i}" for i in range(1, 8))
+
+
+@dataclass(frozen=True)
+class Row:
+    figure: str
+    got: str
+    plain: str
+    wanted: str
+
+
+@dataclass(frozen=True)
+class Pixels:
+    """A few distinct frames of every camera, with the texture and noise of real sensors."""
+
+    color: list[np.ndarray]
+    depth: list[np.ndarray]
+    mono: list[np.ndarray]
+
+    @staticmethod
+    def of(width: int, height: int) -> Pixels:
+        rng = np.random.default_rng(0)
+        frames = Pixels([], [], [])
+        for _ in range(POOL):
+            frames.color.append(textured(rng, width, height, 3))
+            frames.mono.append(textured(rng, *MONO_SIZE, 1))
+            distance_m = np.linspace(1.4, 0.6, height)[:, None] + np.zeros((1, width))
+            depth = np.rint(1000 * (distance_m + rng.normal(0, 0.0015, (height, width)) * distance_m**2))
+            depth[cv2.resize(rng.random((12, 16)), (width, height)) > 0.75] = 0
+            frames.depth.append(depth.astype(np.uint16))
+        return frames
+
+
+def textured(rng: np.random.Generator, width: int, height: int, channels: int) -> np.ndarray:
+    coarse = rng.integers(40, 200, (height // 40, width // 40, channels), dtype=np.uint8)
+    image = cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC).reshape(height, width, channels)
+    noisy = image + rng.normal(0, 2.5, image.shape)
+    return np.ascontiguousarray(noisy.clip(0, 255).astype(np.uint8).squeeze())
+
+
+def raw_mb_per_s(width: int, height: int) -> float:
+    return (FPS * (width * height * 5 + len(MONOS) * MONO_SIZE[0] * MONO_SIZE[1]) + ARM_HZ * 400) / 1e6
+
+
+def arm_batch(frame: int) -> ArmStates:
+    """What the arm said during one frame: 33 or 34 samples."""
+    first, last = frame * ARM_HZ // FPS, (frame + 1) * ARM_HZ // FPS
+    rng = np.random.default_rng(frame)
+    n = last - first
+    times_ns = np.arange(first, last, dtype=np.int64) * (10**9 // ARM_HZ)
+    return ArmStates(times_ns, JOINTS, rng.normal(size=(n, 7)), rng.normal(size=(n, 7)), np.full(n, 0.04))
+
+
+def write_frame(toss: TossWriter, pixels: Pixels, i: int, lossless: bool) -> None:
+    """One frame of the whole lab, encoded and written."""
+    time_ns, k = i * 10**9 // FPS, i % POOL
+    height, width = pixels.depth[0].shape
+    jpeg = cv2.imencode(".jpg", pixels.color[k], JPEG)[1].tobytes()
+    toss.color(EncodedImage("d455", i, time_ns, time_ns, "jpeg", width, height, jpeg))
+    toss.depth(DepthImage("d455", i, time_ns, time_ns, 0.001, pixels.depth[k]))
+    for c, name in enumerate(MONOS):
+        image = pixels.mono[(k + c) % POOL]
+        if lossless:
+            toss.mono(EncodedImage(name, i, time_ns, time_ns, "mono8", *MONO_SIZE, image.tobytes()))
+        else:
+            jpeg = cv2.imencode(".jpg", image, JPEG)[1].tobytes()
+            toss.mono(EncodedImage(name, i, time_ns, time_ns, "jpeg", *MONO_SIZE, jpeg))
+    toss.arm(arm_batch(i))
+
+
+def calibration(width: int, height: int) -> RigCalibration:
+    def camera(name: str, w: int, h: int) -> CameraModel:
+        return CameraModel(name, w, h, np.array([[0.6 * w, 0, w / 2], [0, 0.6 * w, h / 2], [0, 0, 1.0]]))
+
+    return RigCalibration({"d455": camera("d455", width, height), **{n: camera(n, *MONO_SIZE) for n in MONOS}})
+
+
+def write_ours(folder: Path, pixels: Pixels, seconds: float, lossless: bool) -> None:
+    height, width = pixels.depth[0].shape
+    with SessionWriter(folder, {"object": {"name": "bench"}}, calibration(width, height)) as session:
+        with session.toss(0) as toss:
+            paced(seconds, lambda i: write_frame(toss, pixels, i, lossless))
+        session.finish()
+
+
+def write_plain(path: Path, pixels: Pixels, seconds: float) -> None:
+    """What one writes without tosslab: JPEG images, depth as 16UC1, mcap.Writer with its own zstd chunks."""
+    with open(path, "wb") as out:
+        writer = PlainWriter(out)
+        writer.start()
+        schemas = {
+            m: writer.register_schema(m.DESCRIPTOR.full_name, "protobuf", schema_descriptor(m))
+            for m in (CompressedImage, RawImage, JointStates)
+        }
+        kinds = {"/d455/color": CompressedImage, "/d455/depth": RawImage, "/arm/joint_states": JointStates}
+        kinds |= {f"/{n}/image": CompressedImage for n in MONOS}
+        channels = {topic: writer.register_channel(topic, "protobuf", schemas[m]) for topic, m in kinds.items()}
+
+        def frame(i: int) -> None:
+            time_ns, k = i * 10**9 // FPS, i % POOL
+            images = {f"/{n}/image": pixels.mono[(k + c) % POOL] for c, n in enumerate(MONOS)}
+            images["/d455/color"] = pixels.color[k]
+            for topic, image in images.items():
+                box = CompressedImage(format="jpeg", data=cv2.imencode(".jpg", image, JPEG)[1].tobytes())
+                writer.add_message(channels[topic], time_ns, box.SerializeToString(), time_ns, i)
+            height, width = pixels.depth[k].shape
+            raw = RawImage(width=width, height=height, encoding="16UC1", step=2 * width, data=pixels.depth[k].tobytes())
+            writer.add_message(channels["/d455/depth"], time_ns, raw.SerializeToString(), time_ns, i)
+            arm = arm_batch(i)
+            for s, sample_ns in enumerate(arm.time_ns.tolist()):
+                box = JointStates()
+                for j, name in enumerate(JOINTS):
+                    box.joints.add(name=name, position=arm.q_rad[s, j], velocity=arm.dq_rad_s[s, j])
+                writer.add_message(channels["/arm/joint_states"], sample_ns, box.SerializeToString(), sample_ns, s)
+
+        paced(seconds, frame)
+        writer.finish()
+
+
+def paced(seconds: float, frame: Callable[[int], None]) -> None:
+    """Frames at the lab's pace (late ones follow at once), so that chunks close and files sync as they would there."""
+    began = time.monotonic()
+    for i in range(int(seconds * FPS)):
+        time.sleep(max(0.0, began + i / FPS - time.monotonic()))
+        frame(i)
+
+
+def alone(work: Callable[..., None], *args: Any) -> tuple[float, float, float]:
+    """CPU seconds, wall seconds and peak RSS in MB of `work` in a process of its own, without the making of frames."""
+    receive, send = multiprocessing.get_context("fork").Pipe(False)
+
+    def child() -> None:
+        cpu, wall = time.process_time(), time.monotonic()
+        work(*args)
+        rss = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+        send.send((time.process_time() - cpu, time.monotonic() - wall, rss))
+
+    process = multiprocessing.get_context("fork").Process(target=child)
+    process.start()
+    measured: tuple[float, float, float] = receive.recv()
+    process.join()
+    return measured
+
+
+def best_ms(work: Callable[[], object], times: int = 15) -> float:
+    spent = []
+    for _ in range(times):
+        began = time.thread_time()
+        work()
+        spent.append(time.thread_time() - began)
+    return min(spent) * 1e3
+
+
+def bench_codec(_: Path, quick: bool) -> Iterator[Row]:
+    for name, pattern in (("cube_dev", "toss_0[0-4]"), ("lab_dev", "toss_0*"), ("jack_push", "")):
+        folders = sorted((DATA / name).glob(pattern)) if pattern else [DATA / name]
+        files = [f for folder in folders for f in sorted((folder / "depth").glob("*.png"))[5 :: 40 if quick else 15]]
+        if not files:
+            yield Row(f"depth codec on {name}", "no data (TOSSLAB_DATA)", "", "")
+            continue
+        ours, png, unpack, sizes = [], [], [], []
+        for file in files:
+            raw = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+            packed = pack_depth(raw)
+            assert (unpack_depth(packed, *raw.shape) == raw).all()
+            sizes.append((len(packed), len(cv2.imencode(".png", raw)[1])))
+            ours.append(best_ms(lambda raw=raw: pack_depth(raw)))
+            png.append(best_ms(lambda raw=raw: cv2.imencode(".png", raw)))
+            unpack.append(best_ms(lambda packed=packed, raw=raw: unpack_depth(packed, *raw.shape)))
+        kb = np.mean(sizes, axis=0) / 1e3
+        larger = max(a / b for a, b in sizes)
+        yield Row(
+            f"depth codec on {name}, {len(files)} frames",
+            f"{np.mean(ours):.2f} ms, {kb[0]:.1f} kB (unpack {np.mean(unpack):.2f} ms); "
+            f"{np.mean(png) / np.mean(ours):.1f} x faster, at most {larger:.2f} of PNG's size",
+            f"PNG {np.mean(png):.2f} ms, {kb[1]:.1f} kB",
+            "3 x faster than PNG, not larger",
+        )
+
+
+def bench_write(folder: Path, quick: bool) -> Iterator[Row]:
+    seconds = 3.0 if quick else 10.0
+    for width, height in ((640, 480), (848, 480)):
+        pixels = Pixels.of(width, height)
+        plain_path = folder / "plain.mcap"
+        plain = alone(write_plain, plain_path, pixels, seconds)
+        plain_text = write_cost(plain, seconds, plain_path)
+        plain_path.unlink()
+        for lossless in (False, True):
+            out = folder / f"ours_{lossless}"
+            ours = alone(write_ours, out, pixels, seconds, lossless)
+            yield Row(
+                f"write {width}x{height} RGBD + 3 mono, mono {'lossless (zstd)' if lossless else 'JPEG 95'}, "
+                f"{raw_mb_per_s(width, height):.0f} MB raw/s",
+                write_cost(ours, seconds, out / "toss_00.mcap"),
+                plain_text,
+                "<= 0.5 CPU-s/s, < 400 MB",
+            )
+            shutil.rmtree(out)
+
+
+def write_cost(spent: tuple[float, float, float], seconds: float, path: Path) -> str:
+    cpu_s, wall_s, rss_mb = spent
+    size_mb = path.stat().st_size / 1e6
+    return f"{cpu_s / seconds:.2f} CPU-s/s ({wall_s / seconds:.2f} s wall/s), {size_mb / seconds:.0f} MB/s, {rss_mb:.0f} MB RSS"
+
+
+def bench_read(folder: Path, quick: bool) -> Iterator[Row]:
+    pixels = Pixels.of(640, 480)
+    write_as_fast_as_possible(folder / "read", pixels, 60 if quick else 240)
+    path = folder / "read" / "toss_00.mcap"
+    ours, plain = [], []
+    for _ in range(3):
+        began = time.process_time()
+        read_ours(path)
+        ours.append(time.process_time() - began)
+        began = time.process_time()
+        frames = read_plain(path)
+        plain.append(time.process_time() - began)
+    yield Row(
+        f"read and decode {frames} images in order",
+        f"{min(ours):.2f} CPU-s ({frames / min(ours):.0f}/s, {min(ours) / min(plain):.2f} of plain)",
+        f"make_reader {min(plain):.2f} CPU-s ({frames / min(plain):.0f}/s)",
+        "at least as fast as the plain loop",
+    )
+    shutil.rmtree(folder / "read")
+
+
+def write_as_fast_as_possible(folder: Path, pixels: Pixels, frames: int) -> None:
+    with SessionWriter(folder, {}, calibration(640, 480)) as session:
+        with session.toss(0) as toss:
+            for i in range(frames):
+                write_frame(toss, pixels, i, lossless=False)
+        session.finish()
+
+
+def read_ours(path: Path) -> None:
+    with Session.open(path) as session:
+        toss = session.toss(0)
+        streams = [toss.color(), *(toss.mono(n) for n in MONOS)]
+        depths = toss.depth()
+        for i in range(len(depths)):
+            _ = depths[i].raw
+            for stream in streams:
+                decode_image(stream[i])
+
+
+def read_plain(path: Path) -> int:
+    """The same pixels by mcap's reader and the generated protobuf classes."""
+    count = 0
+    with open(path, "rb") as file:
+        for schema, _, message in make_reader(file).iter_messages():
+            if schema.name == "foxglove.CompressedImage":
+                image = cv2.imdecode(
+                    np.frombuffer(CompressedImage.FromString(message.data).data, np.uint8), cv2.IMREAD_UNCHANGED
+                )
+                _ = cv2.cvtColor(image, cv2.COLOR_BGR2RGB) if image.ndim == 3 else image
+                count += 1
+            elif schema.name == "tosslab.DepthImage":
+                box = DepthMessage.FromString(message.data)
+                unpack_depth(box.data, box.height, box.width)
+                count += 1
+    return count
+
+
+def bench_info(folder: Path, quick: bool) -> Iterator[Row]:
+    size = 200_000_000 if quick else 2_000_000_000
+    big = folder / "big"
+    with SessionWriter(big, {"object": {"name": "bench"}}, calibration(640, 480)) as session:
+        with session.toss(0) as toss:
+            noise = os.urandom(313_000)
+            for i in range(size // 1_050_000):
+                time_ns = i * 10**9 // FPS
+                for name in MONOS:
+                    toss.mono(EncodedImage(name, i, time_ns, time_ns, "jpeg", *MONO_SIZE, noise))
+                toss.color(EncodedImage("d455", i, time_ns, time_ns, "jpeg", 640, 480, noise[:94_000]))
+                toss.arm(arm_batch(i))
+        session.finish()
+    path = big / "toss_00.mcap"
+    for target in (path, big):
+        cpu_s, wall_s, rss_mb = of_command("info", str(target))
+        yield Row(
+            f"toss-session info on {'a file' if target == path else 'a session'} of {path.stat().st_size / 1e9:.1f} GB",
+            f"{cpu_s:.2f} CPU-s, {wall_s:.2f} s, {rss_mb:.0f} MB RSS",
+            "",
+            "< 2 s, < 300 MB",
+        )
+    cpu_s, wall_s, rss_mb = of_command("verify", str(path))
+    yield Row("toss-session verify on that file", f"{cpu_s:.1f} CPU-s, {wall_s:.1f} s, {rss_mb:.0f} MB RSS", "", "")
+    shutil.rmtree(big)
+
+
+def of_command(*arguments: str) -> tuple[float, float, float]:
+    """CPU, wall and peak RSS of `python arguments`, its start included."""
+    began = time.monotonic()
+    program = "import sys; from recordings.cli_session import main; sys.exit(main(sys.argv[1:]))"
+    child = subprocess.Popen(
+        [sys.executable, "-c", program, *arguments], cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
+    _, status, usage = os.wait4(child.pid, 0)
+    assert os.waitstatus_to_exitcode(status) in (0, 1), status
+    return usage.ru_utime + usage.ru_stime, time.monotonic() - began, usage.ru_maxrss / 1024
+
+
+def bench_kill(folder: Path, quick: bool) -> Iterator[Row]:
+    """A writer in a process of its own is killed at a random instant while it writes its second toss."""
+    kills = 8 if quick else 50
+    rng = np.random.default_rng(1)
+    pixels = Pixels.of(640, 480)
+    recovered = identical = 0
+    worst_bytes, worst_ms, lost = 0.0, 0.0, []
+    for i in range(kills):
+        session, saved = folder / f"killed_{i}", folder / f"saved_{i}"
+        accepted, sha256 = killed(session, pixels, float(rng.uniform(0.0, 1.5)))
+        reports = {r.source: r for r in recover(session, saved)}
+        identical += reports["toss_00.mcap"].sha256 == sha256
+        kept = reports["toss_01.mcap"].kept if "toss_01.mcap" in reports else {}
+        got = kept.get("/d455/color", 0)
+        missing = max(0, accepted - got)
+        lost.append(missing)
+        recovered += Session.open(saved).stop["status"] == "recovered"
+        if "toss_01.mcap" in reports and kept:
+            with Session.open(saved) as opened:
+                assert len(opened.toss(1).color()) == got
+        worst_ms = max(worst_ms, missing * 1e3 / FPS)
+        worst_bytes = max(worst_bytes, missing * 1.07e6)
+        shutil.rmtree(session)
+        shutil.rmtree(saved)
+    yield Row(
+        f"kill -9 at {kills} random instants",
+        f"{recovered} of {kills} recover, {identical} finished tosses byte-identical; frames lost: at most {max(lost)} "
+        f"({worst_ms:.0f} ms), {np.mean(lost):.2f} on average",
+        "",
+        f"all recover; at most the open chunk ({CHUNK_BYTES >> 20} MiB or {CHUNK_NS // 10**6} ms) is lost",
+    )
+
+
+def killed(folder: Path, pixels: Pixels, after_s: float) -> tuple[int, str]:
+    """Whole frames that the writer had accepted of its second toss when it was killed; sha256 of its first."""
+    read_end, write_end = os.pipe()
+    child = os.fork()
+    if child == 0:
+        victim(folder, pixels, write_end)
+    os.close(write_end)
+    with os.fdopen(read_end) as pipe:
+        sha256 = pipe.readline().strip()
+        time.sleep(after_s)
+        os.kill(child, signal.SIGKILL)
+        accepted = len(pipe.read().splitlines())
+    os.waitpid(child, 0)
+    return accepted, sha256
+
+
+def victim(folder: Path, pixels: Pixels, pipe: int) -> None:
+    session = SessionWriter(folder, {}, calibration(640, 480))
+    with session.toss(0) as toss:
+        for i in range(5):
+            write_frame(toss, pixels, i, lossless=False)
+    os.write(pipe, f"{toss.sha256}\n".encode())
+    second = session.toss(1)
+
+    def frame(i: int) -> None:
+        write_frame(second, pixels, i, lossless=False)
+        os.write(pipe, b"accepted\n")
+
+    paced(1e6, frame)
+
+
+PARTS = {"codec": bench_codec, "write": bench_write, "read": bench_read, "info": bench_info, "kill": bench_kill}
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("parts", nargs="*", choices=[*PARTS, []], help="which to run; all by default")
+    parser.add_argument("--quick", action="store_true", help="shorter, smaller, fewer")
+    args = parser.parse_args()
+    cv2.setNumThreads(1)
+    print("| figure | tosslab | plain mcap | wanted |\n|---|---|---|---|", flush=True)
+    with tempfile.TemporaryDirectory(prefix="bench_session_") as folder:
+        for name in args.parts or PARTS:
+            for row in PARTS[name](Path(folder), args.quick):
+                print(f"| {row.figure} | {row.got} | {row.plain} | {row.wanted} |", flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
