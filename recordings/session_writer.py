@@ -7,6 +7,7 @@ import json
 import os
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -205,21 +206,42 @@ class TossWriter:
         self._writer.message(self._channel(topic, schema, None), time_ns, time_ns, 0, payload.data)
 
 
-class SessionWriter:
-    """A session folder being written. The folder must not exist, or be empty. Leaving the context without `finish`
-    writes a stop document with status `failed` or `interrupted`; every finished toss stays whole."""
+@dataclass(frozen=True)
+class FinishedFile:
+    """A file of the session that an earlier run finished: what the stop document says of it."""
 
-    def __init__(self, folder: Path, start: Mapping[str, Any], calibration: RigCalibration = NO_CALIBRATION) -> None:
-        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+    sha256: str
+    streams: Mapping[str, Any]
+    info: Mapping[str, Any]
+
+
+class SessionWriter:
+    """A session folder being written. Leaving the context without `finish` writes a stop document with status `failed`
+    or `interrupted`; every finished toss stays whole.
+
+    The folder must not exist, or be empty, unless `earlier` names the files (by stem) that an interrupted run left
+    there: see session_resume.resume_session.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        start: Mapping[str, Any],
+        calibration: RigCalibration = NO_CALIBRATION,
+        earlier: Mapping[str, FinishedFile] | None = None,
+    ) -> None:
+        if earlier is None and folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
             raise BadInput(f"{folder} exists already; nothing was written. Choose another name or remove it")
         self.folder = folder
+        self._earlier = dict(earlier or {})
         self.start = {"created_unix_ns": time.time_ns(), **start}
         self._calibration = calibration
         self._tosses: dict[str, TossWriter] = {}
         self._info: dict[str, Mapping[str, Any]] = {}
         self._stopped = False
         _make_folder(folder)
-        write_json(folder / "calibration.json", calibration.to_json())
+        if earlier is None:
+            write_json(folder / "calibration.json", calibration.to_json())
         self._write_document(None)
 
     def __enter__(self) -> SessionWriter:
@@ -240,6 +262,22 @@ class SessionWriter:
         """A new toss's file. `info` (JSON values) is kept in it and in session.json, for instance clock offsets."""
         return self._file(toss_name(toss), "toss", {"toss": toss, **(info or {})})
 
+    def add_info(self, toss: int, info: Mapping[str, Any]) -> None:
+        """What is known only after a toss, for instance its verdict: kept in session.json."""
+        name = toss_name(toss)
+        if name not in self._info:
+            raise BadInput(f"{name} was not written by this session; it wrote {', '.join(self._info) or 'nothing'}")
+        self._info[name] = {**self._info[name], **info}
+
+    def discard(self, toss: int) -> None:
+        """Remove a rejected take of this run, whole or not; its number is free again."""
+        name = toss_name(toss)
+        if name not in self._tosses:
+            raise BadInput(f"{name} was not written by this run; nothing was removed")
+        self._tosses[name].abandon()
+        self._tosses[name].path.unlink(missing_ok=True)
+        del self._tosses[name], self._info[name]
+
     def calibration_views(self) -> TossWriter:
         """calibration.mcap: views of a board, one image of each camera per view, stamped one second apart."""
         return self._file("calibration", "calibration", {})
@@ -250,15 +288,22 @@ class SessionWriter:
         A toss that is still open is left as it is, recoverable and without a sha256.
         """
         self._abandon_open_tosses()
-        sha256 = {t.path.name: t.sha256 for t in self._tosses.values() if t.sha256 is not None}
+        sha256 = {f"{name}.mcap": f.sha256 for name, f in self._earlier.items()}
+        sha256 |= {t.path.name: t.sha256 for t in self._tosses.values() if t.sha256 is not None}
         sha256["calibration.json"] = file_sha256(self.folder / "calibration.json")
         self._write_document(
             {
                 "stopped_unix_ns": time.time_ns(),
                 "status": status,
                 "reason": reason,
-                "streams": {name: t.streams() for name, t in self._tosses.items()},
-                "tosses": {name: dict(info) for name, info in self._info.items()},
+                "streams": {
+                    **{name: dict(f.streams) for name, f in self._earlier.items()},
+                    **{name: t.streams() for name, t in self._tosses.items()},
+                },
+                "tosses": {
+                    **{name: dict(f.info) for name, f in self._earlier.items()},
+                    **{name: dict(info) for name, info in self._info.items()},
+                },
                 "sha256": sha256,
             }
         )
@@ -270,7 +315,7 @@ class SessionWriter:
                 toss.abandon()
 
     def _file(self, name: str, kind: str, info: Mapping[str, Any]) -> TossWriter:
-        if name in self._tosses:
+        if name in self._tosses or name in self._earlier:
             raise BadInput(f"{name} was written already in this session; nothing was changed")
         writer = TossWriter(self.folder / f"{name}.mcap", self.start, self._calibration, kind, info)
         self._tosses[name], self._info[name] = writer, info

@@ -255,7 +255,8 @@ def bench_write(folder: Path, quick: bool) -> Iterator[Row]:
 def write_cost(spent: tuple[float, float, float], seconds: float, path: Path) -> str:
     cpu_s, wall_s, rss_mb = spent
     size_mb = path.stat().st_size / 1e6
-    return f"{cpu_s / seconds:.2f} CPU-s/s ({wall_s / seconds:.2f} s wall/s), {size_mb / seconds:.0f} MB/s, {rss_mb:.0f} MB RSS"
+    per_s = f"{cpu_s / seconds:.2f} CPU-s/s ({wall_s / seconds:.2f} s wall/s), {size_mb / seconds:.0f} MB/s"
+    return f"{per_s}, {rss_mb:.0f} MB RSS"
 
 
 def bench_read(folder: Path, quick: bool) -> Iterator[Row]:

@@ -14,6 +14,7 @@ from mcap.writer import Writer as PlainWriter
 from recordings.cli_session import main
 from recordings.errors import BadInput
 from recordings.geometry import CameraModel
+from recordings.manifest import renew
 from recordings.records import StampedPose
 from recordings.session import Session
 from recordings.session_writer import SessionWriter, write_truth
@@ -373,3 +374,13 @@ def test_the_imported_development_sessions_are_whole(data, tmp_path):
     assert all("gaps in the stamps" in w.text for w in report.warnings)
     with Session.open(tmp_path / "lab") as session, pytest.raises(BadInput, match="has no toss 5"):
         session.toss(5)
+
+
+def test_a_calibration_that_a_command_renewed_is_signed_anew(write_session):
+    folder = write_session()
+    path = folder / "calibration.json"
+    path.write_text(path.read_text().replace("tag36h11", "tag25h9"))
+    renew(folder, "calibration.json")
+    assert verify(folder).findings == ()
+    with pytest.raises(BadInput, match=r"has no truth\.json; nothing was signed"):
+        renew(folder, "truth.json")
