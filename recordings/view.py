@@ -85,7 +85,7 @@ def screenshot(
             viewer.client.open(str(path.resolve()))
         else:
             toss = scene.tosses[0]
-            stream(scene.only((toss,)), viewer, look)
+            stream(scene, viewer, look, tosses=(toss,))
             shift_ns = scene.shift_ns[toss]
             viewer.wait_for(TIME, scene.spans_ns[toss][1] + shift_ns)
             viewer.show(TIME, moment_ns(scene, toss) + shift_ns)
@@ -111,11 +111,17 @@ def open_viewer(path: Path, choice: Choice = Choice(), look: Look = LOOK, progre
         viewer.wait_until_closed()
 
 
-def stream(scene: Scene, viewer: Viewer, look: Look = LOOK, progress: Progress = SILENT) -> None:
-    """Send a scene to a running viewer; returns when all of it has arrived."""
+def stream(
+    scene: Scene,
+    viewer: Viewer,
+    look: Look = LOOK,
+    progress: Progress = SILENT,
+    tosses: tuple[int, ...] | None = None,
+) -> None:
+    """Send a scene, or some tosses of it, to a running viewer; returns when all of it has arrived."""
     recording = _recording(scene)
     recording.connect_grpc(viewer.url, default_blueprint=blueprint(scene))
-    fill(recording, scene, look, progress)
+    fill(recording, scene, look, progress, tosses)
     recording.disconnect()
 
 
@@ -145,14 +151,20 @@ def is_foreign(path: Path) -> bool:
         return not file.metadata("tosslab")
 
 
-def fill(recording: rr.RecordingStream, scene: Scene, look: Look, progress: Progress) -> None:
-    """Log all of a scene, toss by toss, so that a live viewer has the first one at once."""
+def fill(
+    recording: rr.RecordingStream,
+    scene: Scene,
+    look: Look,
+    progress: Progress,
+    tosses: tuple[int, ...] | None = None,
+) -> None:
+    """Log a scene (or some tosses of it) toss by toss, so that a live viewer has the first one at once."""
     recording.log(ABOUT, rr.TextDocument(about_text(scene), media_type=rr.MediaType.MARKDOWN), static=True)
     log_rig(recording, scene, look)
     robot = known_arm(scene)
     if robot is not None:
         log_arm_model(recording, robot)
-    for toss in scene.tosses:
+    for toss in scene.tosses if tosses is None else tosses:
         clock = Clock(recording, toss, scene.shift_ns[toss])
         start_ns, end_ns = scene.spans_ns[toss]
         clear(clock.at(start_ns))
