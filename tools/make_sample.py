@@ -26,9 +26,9 @@ LARGEST_BYTES = 12_000_000
 def make(out: Path) -> int:
     """Simulate, import as any user would, return the size in bytes. `out` is replaced when all is well."""
     with tempfile.TemporaryDirectory() as scratch:
-        folder = Path(scratch) / "box_toss"
+        folder = Path(scratch) / "layout" / "box_toss"
         truth = write_session(Lab(SAMPLE), range(SAMPLE_TOSSES), folder, Console("sample"))
-        session = Path(scratch) / "session"
+        session = Path(scratch) / "box_toss"
         import_folder(folder, session, truth)
         size = sum(f.stat().st_size for f in session.rglob("*") if f.is_file())
         if size > LARGEST_BYTES:

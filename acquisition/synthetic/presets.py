@@ -67,7 +67,7 @@ PRESETS: dict[str, SceneConfig] = {
     "spin-12": replace(BOX, motion=MotionConfig(spin_rad_s=12.0)),
     "spin-20": replace(BOX, motion=MotionConfig(spin_rad_s=20.0, lead_in_s=0.15)),
     # camera
-    "near": replace(BOX, camera=CameraConfig(distance_m=0.55), motion=MotionConfig(release_height_m=0.2)),
+    "near": replace(BOX, camera=CameraConfig(distance_m=0.5), motion=MotionConfig(release_height_m=0.18)),
     "far": replace(BOX, camera=CameraConfig(distance_m=1.2)),
     "distorted": replace(BOX, camera=CameraConfig(distortion=(-0.055, 0.065, 0.0006, -0.0004, -0.02))),
     "dropped": replace(BOX, camera=CameraConfig(dropped_share=0.05)),
