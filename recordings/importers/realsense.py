@@ -23,6 +23,7 @@ from recordings.geometry import CameraModel, Transform
 from recordings.importers import common
 from recordings.importers.common import ImportReport, Warnings
 from recordings.importers.lens import fit_brown_conrady
+from recordings.importers.realsense_file import recorded
 from recordings.progress import Progress, Silent
 from recordings.records import DepthImage, EncodedImage
 from recordings.session_writer import TossWriter
@@ -238,6 +239,12 @@ def _write_toss(toss: TossWriter, source: Path, unit_m: float, warnings: Warning
             toss.color(EncodedImage("d455", frame.number, time_ns, time_ns, "rgb8", *size, rgb.tobytes()))
     if seen.counts["color"] == 0:
         raise BadInput(f"{source} holds {seen.counts['depth']} depth and no colour images; is it whole?")
+    for kind, wanted in recorded(source).counts.items():
+        found = seen.counts[kind] + toss.streams().get(f"/d455/{kind}", {}).get("dropped", 0)
+        if found != wanted:
+            raise BadInput(
+                f"{source}: the RealSense SDK gave {found} of its {wanted} {kind} images; is it whole? Try again"
+            )
     for domain in sorted(seen.domains - {"hardware_clock"}):
         warnings.add(f"{source.name}: stamps are of the domain {domain}, not of the device's own clock")
 
@@ -246,29 +253,46 @@ def _frames(source: Path) -> Iterator[_Frame]:
     """Every colour and depth frame of a recording, in the order of the recording, without loss."""
     rs = _sdk()
     waiting: queue.Queue[_Frame] = queue.Queue(WAITING)
-    ended, left = threading.Event(), threading.Event()
+    ended, left, started = threading.Event(), threading.Event(), threading.Event()
+    first = recorded(source).first_sensor
 
     def take(frame: Any) -> None:
+        started.wait()  # the playback waits with us: it begins with the first sensor, and none may miss a frame
         if not left.is_set():
             waiting.put(_copied(frame))
 
     with _playback(source) as device:
         device.set_status_changed_callback(lambda s: ended.set() if s == rs.playback_status.stopped else None)
-        sensors = device.query_sensors()
-        for sensor in sensors:
-            chosen = [p for p in sensor.get_stream_profiles() if p.stream_type() in (rs.stream.color, rs.stream.depth)]
-            if chosen:
-                sensor.open(chosen[:2])
-                sensor.start(take)
+        opened = _open_sensors(device)
         try:
+            for number in sorted(opened, key=lambda n: n != first):
+                opened[number].start(take)
+            started.set()
             yield from _drained(waiting, ended, source)
         finally:
             left.set()
+            started.set()
             _empty(waiting)
-            for sensor in sensors:
+            for sensor in opened.values():
                 if sensor.get_active_streams():
                     sensor.stop()
                     sensor.close()
+
+
+def _open_sensors(device: Any) -> dict[int, Any]:
+    """The sensors that give colour or depth by their number, opened for one stream of each."""
+    rs = _sdk()
+    opened, wanted = {}, {rs.stream.color, rs.stream.depth}
+    for number, sensor in enumerate(device.query_sensors()):
+        chosen: dict[Any, Any] = {}
+        for profile in sensor.get_stream_profiles():
+            if profile.stream_type() in wanted:
+                chosen.setdefault(profile.stream_type(), profile)
+        if chosen:
+            sensor.open(list(chosen.values()))
+            opened[number] = sensor
+            wanted -= set(chosen)
+    return opened
 
 
 def _drained(waiting: queue.Queue[_Frame], ended: threading.Event, source: Path) -> Iterator[_Frame]:
