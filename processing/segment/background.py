@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Bool, Float
 from numpy import ndarray as Array
 
 from processing.segment.foreground import (
@@ -27,7 +27,7 @@ from processing.segment.foreground import (
 )
 from processing.segment.likeness import Likeness
 from processing.segment.segmenter import Example, FrameMask
-from processing.segment.static_scene import StaticScene, with_object_removed
+from processing.segment.static_scene import StaticScene, surroundings, with_object_removed
 from recordings.errors import BadInput
 from recordings.geometry import CameraModel
 from recordings.progress import Progress
@@ -45,8 +45,12 @@ class BackgroundSettings:
     """A component larger than the expected mask by this factor holds something else as well."""
     depth_margin_m: float = 0.04
     """The object's depth in a frame exceeds the last frame's range by no more than this, when others touch it."""
-    part_of_scene: float = 0.5
-    """An object less of which moved than this was learned as a part of the scene."""
+    sure: float = 0.7
+    """Colours are learned from masks that are more confident than this."""
+    part_of_scene: float = 0.9
+    """An object less of which stands out from the scene than this was partly learned as scene."""
+    unknown: float = 0.02
+    """A component with a larger share of pixels whose scene is unknown is told by its own colours."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +90,7 @@ class BackgroundSegmenter:
             start, first = self._find(frames, example, robot)
         else:
             first = given[start]
-        scene = self._scene_without(frames[start], first)
+        s, scene = self._settings, self._scene_without(frames[start], first)
         yield FrameMask(start, first, 1.0 if start in given else 0.8)
         done = 1
         for order in (range(start + 1, len(frames)), range(start - 1, -1, -1)):
@@ -94,19 +98,19 @@ class BackgroundSegmenter:
             for i in order:
                 block = None if robot is None else robot[i]
                 frame = frames[i]
-                mask, confidence = (
-                    (given[i], 1.0) if i in given else _follow(frame, scene, memory, block, self._settings)
-                )
-                memory = _remember(memory, frame, mask)
+                mask, confidence = (given[i], 1.0) if i in given else _follow(frame, scene, memory, block, s)
+                memory = _remember(memory, frame, mask, learn=confidence > s.sure)
                 done += 1
                 progress.step(done, len(frames), "masks")
                 yield FrameMask(i, mask, confidence)
 
     def _scene_without(self, frame: RgbdFrame, mask: Bool[Array, "h w"]) -> StaticScene:
         moved = moved_pixels(frame, self._scene, self._settings.foreground)
-        if (moved & mask).sum() >= self._settings.part_of_scene * mask.sum():
+        stands_out = (moved & mask).sum() >= self._settings.part_of_scene * mask.sum()
+        unknown = (~self._scene.known & surroundings(mask)).sum()
+        if stands_out and unknown <= self._settings.unknown * mask.sum():
             return self._scene
-        return with_object_removed(self._scene, frame, mask, self._camera)
+        return with_object_removed(self._scene, frame, mask, moved, self._camera)
 
     def _find(
         self, frames: Sequence[RgbdFrame], example: Example | None, robot: Sequence[Bool[Array, "h w"]] | None
@@ -167,8 +171,8 @@ def _best_candidate(
     return best
 
 
-def _remember(memory: _Memory | None, frame: RgbdFrame, mask: Bool[Array, "h w"]) -> _Memory:
-    """Memory after a frame. An empty mask leaves everything but the count of misses."""
+def _remember(memory: _Memory | None, frame: RgbdFrame, mask: Bool[Array, "h w"], learn: bool = True) -> _Memory:
+    """Memory after a frame. An empty mask leaves everything but the count of misses; colours are learned on request."""
     if memory is not None and not mask.any():
         return replace(memory, missed=memory.missed + 1)
     depth = frame.depth_m[mask & (frame.depth_m > 0)]
@@ -176,7 +180,8 @@ def _remember(memory: _Memory | None, frame: RgbdFrame, mask: Bool[Array, "h w"]
     if memory is None:
         return _Memory(mask, np.zeros(2), (low, high), Likeness.of(frame.color_rgb, mask))
     velocity = (_center(mask) - _center(memory.mask)) / (memory.missed + 1)
-    return _Memory(mask, velocity, (low, high), memory.likeness.learned(frame.color_rgb, mask))
+    likeness = memory.likeness.learned(frame.color_rgb, mask) if learn else memory.likeness
+    return _Memory(mask, velocity, (low, high), likeness)
 
 
 def _center(mask: Bool[Array, "h w"]) -> Float[Array, "2"]:
@@ -202,9 +207,10 @@ def _follow(
     rough = _component_in(moved, near)
     if rough.sum() < s.least_px:
         return np.zeros_like(rough), 0.0
-    strange = not scene.known[cv2.dilate(rough.astype(np.uint8), kernel(5)) > 0].all()
+    wide = cv2.dilate(rough.astype(np.uint8), kernel(5)) > 0
+    strange = (wide & ~scene.known).sum() > s.unknown * rough.sum()
     if strange or rough.sum() > s.grown * area:
-        rough = _among_others(frame, scene, moved, expected, likeness, memory, s)
+        rough = _among_others(frame, scene, moved, expected, memory, s)
         if rough.sum() < s.least_px:
             return np.zeros_like(rough), 0.0
         mask, sure = rough, 0.6
@@ -234,7 +240,6 @@ def _among_others(
     scene: StaticScene,
     moved: Bool[Array, "h w"],
     expected: Bool[Array, "h w"],
-    likeness: Float32[Array, "h w"],
     memory: _Memory,
     s: BackgroundSettings,
 ) -> Bool[Array, "h w"]:
@@ -248,7 +253,8 @@ def _among_others(
     place = np.clip((inward - outward) / 5.0, -3.0, 1.5)
     depth, (low, high) = frame.depth_m[at], memory.depth_range_m
     elsewhere = (depth > 0) & ((depth < low - s.depth_margin_m) | (depth > high + s.depth_margin_m))
-    odds = not_scene + s.foreground.weight_likeness * likeness[at] + place - 4.0 * elsewhere
+    likeness = memory.likeness.log_odds(frame.color_rgb[at], crowded=True)
+    odds = not_scene + s.foreground.weight_likeness * likeness + place - 4.0 * elsewhere
     odds = np.where(moved[at], odds, np.minimum(odds, -1.0)).astype(np.float32)
     belief = smooth(odds, frame.color_rgb[at].astype(np.float32), s.foreground)
     out = np.zeros_like(expected)

@@ -51,10 +51,11 @@ def kernel(radius_px: int) -> UInt8[Array, "k k"]:
 
 
 def nearer_than_scene(depth_m: Float32[Array, "h w"], scene: StaticScene, s: ForegroundSettings) -> Bool[Array, "h w"]:
-    """Pixels with a return clearly in front of the scene; any return counts where the scene gives none."""
+    """Pixels with a return clearly in front of the scene; any return counts where the scene is known to give none."""
     sigma = np.maximum(scene.depth_sigma_m, stereo_sigma_m(scene.depth_m))
     least = np.maximum(s.nearer_m, s.nearer_sigmas * sigma)
-    return (depth_m > 0) & ((scene.depth_m == 0) | (scene.depth_m - depth_m > least))
+    empty = (scene.depth_m == 0) & scene.known
+    return (depth_m > 0) & (empty | (scene.depth_m - depth_m > least))
 
 
 def moved_pixels(frame: RgbdFrame, scene: StaticScene, s: ForegroundSettings) -> Bool[Array, "h w"]:
@@ -81,9 +82,9 @@ def evidence(
     scene: StaticScene,
     rough: Bool[Array, "h w"],
     at: Window,
-    likeness: Float32[Array, "h w"] | None,
+    likeness: Float32[Array, "a b"] | None,
     s: ForegroundSettings,
-) -> Float32[Array, "h w"]:
+) -> Float32[Array, "a b"]:
     """Log-odds that a pixel of the window is the object, from its colour and its depth against the scene's.
 
     A pixel at the scene's depth may lie in the object's shadow, so only another hue speaks for the object there.

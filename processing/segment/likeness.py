@@ -41,11 +41,16 @@ class Likeness:
             around=MEMORY * self.around + (1 - MEMORY) * around,
         )
 
-    def log_odds(self, color_rgb: UInt8[Array, "h w 3"]) -> Float32[Array, "h w"]:
-        """log(P(colour | object) / P(colour | surroundings)), within +-MOST."""
+    def log_odds(self, color_rgb: UInt8[Array, "h w 3"], crowded: bool = False) -> Float32[Array, "h w"]:
+        """log(P(colour | object) / P(colour | surroundings)), within +-MOST.
+
+        A colour seen on neither side speaks for none; where other things touch the object (`crowded`), it is theirs.
+        """
         inside = 0.5 * (self.first + self.recent)
-        table = np.log((inside + UNSEEN) / (self.around + UNSEEN)).clip(-MOST, MOST).astype(np.float32)
-        return cv2.blur(table[_cells(color_rgb)], (3, 3))
+        table = np.log((inside + UNSEEN) / (self.around + UNSEEN)).clip(-MOST, MOST)
+        if crowded:
+            table = np.where(inside + self.around < 0.1 * UNSEEN, -MOST, table)
+        return cv2.blur(table.astype(np.float32)[_cells(color_rgb)], (3, 3))
 
 
 def _cells(color_rgb: UInt8[Array, "h w 3"]) -> Int[Array, "h w"]:

@@ -25,8 +25,10 @@ class SceneSettings:
     """The scene lies at this quantile of the depths seen by a pixel: things in front of it come and go."""
     seen_share: float = 0.4
     """A pixel whose depth agrees with the scene in fewer frames has no scene depth."""
+    returns_share: float = 0.3
+    """A pixel without scene depth that gave a return in more frames than this is unknown: something was often there."""
     still_share: float = 0.5
-    """The camera moved when fewer of the pixels agree with the scene in the median frame."""
+    """The camera moved when the scene is known in a smaller share of the pixels."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,20 +80,28 @@ def learn_scene(
         _learn_rows([c[i : i + 40] for c in colors], [d[i : i + 40] for d in depths], settings)
         for i in range(0, height, 40)
     ]
-    depth, sigma, agrees, color, color_sigma = (np.concatenate(part) for part in zip(*rows))
-    still = float(np.median(agrees[depth > 0])) if (depth > 0).any() else 1.0
-    if still < settings.still_share:
+    depth, sigma, color, color_sigma, known = (np.concatenate(part) for part in zip(*rows))
+    known = ~_without_thin_lines(~known)
+    if known.mean() < settings.still_share:
         raise BadInput(
-            f"only {100 * still:.0f} % of the frames agree with a static scene; this camera seems to move. "
+            f"only {100 * known.mean():.0f} % of the pixels show a static scene; this camera seems to move. "
             "Masks need a camera that stands still: record from a fixed one"
         )
-    return StaticScene(depth, sigma, color, color_sigma, np.ones((height, width), dtype=bool), table)
+    depth = np.where(known, depth, table)
+    return StaticScene(depth, sigma, color, color_sigma, known, table)
+
+
+def _without_thin_lines(mask: Bool[Array, "h w"]) -> Bool[Array, "h w"]:
+    """Depth flickers along edges; what was often hidden is a region."""
+    import cv2
+
+    return cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, np.ones((5, 5), np.uint8)) > 0
 
 
 def _learn_rows(
     colors: Sequence[Array], depths: Sequence[Array], settings: SceneSettings
 ) -> tuple[Array, Array, Array, Array, Array]:
-    """Scene depth, its noise, the share of agreeing frames, scene colour and its noise, for some image rows."""
+    """Scene depth, its noise, colour, its noise and whether known, for some rows."""
     z = np.stack(depths)
     seen = z > 0
     count = seen.sum(0)
@@ -106,7 +116,8 @@ def _learn_rows(
     color, color_sigma = _color_median(np.stack(colors), empty)
     valid = share >= settings.seen_share
     depth, sigma = np.where(valid, depth, 0), np.where(valid, sigma, 0)
-    return depth.astype(np.float32), sigma.astype(np.float32), share, color, color_sigma
+    known = valid | (seen.mean(0) < settings.returns_share)
+    return depth.astype(np.float32), sigma.astype(np.float32), color, color_sigma, known
 
 
 def _color_median(colors: Array, empty: Bool[Array, "n h w"]) -> tuple[Float32[Array, "h w 3"], Float32[Array, "h w"]]:
@@ -170,17 +181,20 @@ def fit_plane(
 
 
 def with_object_removed(
-    scene: StaticScene, frame: RgbdFrame, mask: Bool[Array, "h w"], camera: CameraModel | None
+    scene: StaticScene,
+    frame: RgbdFrame,
+    mask: Bool[Array, "h w"],
+    moved: Bool[Array, "h w"],
+    camera: CameraModel | None,
 ) -> StaticScene:
-    """The scene where the object hardly moves, so that it was learned as a part of it.
+    """The scene where the object hardly moves, so that it was learned as a part of it (`moved` is what stood out).
 
     Around the mask, what stands above the table is no longer scene: its depth becomes the table's, its colour unknown.
     Without a calibrated table, the plane that the mask's surroundings lie on serves.
     """
     import cv2
 
-    side = int(np.ceil(np.sqrt(mask.sum())))
-    around = cv2.dilate(mask.astype(np.uint8), np.ones((2 * side + 1, 2 * side + 1), np.uint8)) > 0
+    around = surroundings(mask)
     table = scene.table_depth_m
     if not table.any() and camera is not None:
         ring = around & ~mask & (frame.depth_m > 0)
@@ -189,6 +203,14 @@ def with_object_removed(
         plane = fit_plane(points[:: max(1, len(points) // 4000)], 0.008)
         table = table if plane is None else plane_depth(camera, *plane)
     stands = around & (table > 0) & (table - scene.depth_m > np.maximum(0.008, 4 * stereo_sigma_m(table)))
-    stands = cv2.dilate((stands | mask).astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
-    depth = np.where(stands, table, scene.depth_m).astype(np.float32)
+    stands = cv2.dilate((stands | (mask & ~moved)).astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
+    depth = np.where(stands | ~scene.known, table, scene.depth_m).astype(np.float32)
     return replace(scene, depth_m=depth, known=scene.known & ~stands, table_depth_m=table)
+
+
+def surroundings(mask: Bool[Array, "h w"]) -> Bool[Array, "h w"]:
+    """The mask and what lies within its own size around it."""
+    import cv2
+
+    side = int(np.ceil(np.sqrt(mask.sum())))
+    return cv2.dilate(mask.astype(np.uint8), np.ones((2 * side + 1, 2 * side + 1), np.uint8)) > 0

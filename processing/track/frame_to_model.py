@@ -8,22 +8,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Float32, UInt8
+from jaxtyping import Bool, Float, Float32, Int, UInt8
 from numpy import ndarray as Array
+from scipy.spatial import cKDTree
 
 from processing.track.tracker import Tracked
 from recordings.errors import BadInput
-from recordings.geometry import CameraModel, nearest_rotation
+from recordings.geometry import CameraModel, nearest_rotation, rotation_exp
 from recordings.progress import Progress
 from recordings.records import RgbdFrame
 from recordings.tracks import ObjectShape, ObjectTrack, Status
-
-if TYPE_CHECKING:
-    import open3d
 
 CORRELATED_PX = 9.0
 """Neighbouring depth pixels share their noise: so many count as one measurement in the covariance."""
@@ -51,6 +49,10 @@ class FrameToModelSettings:
     """Below this share, the other starting rotation is tried as well."""
     border_px: int = 1
     """Depth this near to the mask's border is not used: it may be the background's."""
+    point_share: float = 1.0
+    """Weight of point-to-point residuals beside point-to-plane's 1."""
+    still: float = 2e-5
+    """ICP ends when a step is smaller than this (rad, m)."""
     edge_m: float = 0.012
     """A depth pixel this far from its neighbours' median is a flying pixel."""
 
@@ -174,6 +176,14 @@ class _Flattener:
         return _View(depth, np.ascontiguousarray(color), points)
 
 
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """Points of a surface with their normals, in the object frame."""
+
+    points_m: Float[Array, "n 3"]
+    normals: Float[Array, "n 3"]
+
+
 class _Model:
     """A TSDF in sparse blocks, and its surface points."""
 
@@ -183,7 +193,8 @@ class _Model:
         self._s = s
         self._o3d = open3d
         core = open3d.core
-        self._K = core.Tensor(camera.K)
+        half = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])  # Open3D cuts a projected pixel to its integer part
+        self._K = core.Tensor(camera.K + half)
         self._grid: Any = open3d.t.geometry.VoxelBlockGrid(
             ("tsdf", "weight", "color"), (core.float32, core.float32, core.float32), ((1), (1), (3)), s.voxel_m, 8, 4000
         )
@@ -202,13 +213,16 @@ class _Model:
         blocks = hashed.key_tensor()[hashed.active_buf_indices().to(self._o3d.core.int64)]
         self._grid.integrate(blocks, depth, color, self._K, self._K, extrinsic, 1.0, 10.0, self._s.truncation_voxels)
 
-    def facing(self, camera_from_object: Float[Array, "4 4"]) -> open3d.geometry.PointCloud:
-        """Surface points with normals that face a camera at this pose, in the object frame."""
-        cloud = self._grid.extract_point_cloud(weight_threshold=0.5).to_legacy()
+    def facing(self, camera_from_object: Float[Array, "4 4"]) -> Surface:
+        """What faces a camera at this pose."""
+        cloud = self._grid.extract_point_cloud(weight_threshold=0.5)
+        points, normals = (np.asarray(cloud.point[n].numpy(), dtype=np.float64) for n in ("positions", "normals"))
+        order = np.lexsort(points.T)  # Open3D's threads leave them in any order
+        points, normals = points[order], normals[order]
         eye = -camera_from_object[:3, :3].T @ camera_from_object[:3, 3]
-        towards = eye - np.asarray(cloud.points)
-        facing = (towards * np.asarray(cloud.normals)).sum(1) > 0.1 * np.linalg.norm(towards, axis=1)
-        return cloud.select_by_index(np.flatnonzero(facing))
+        towards = eye - points
+        facing = (towards * normals).sum(1) > 0.1 * np.linalg.norm(towards, axis=1)
+        return Surface(points[facing], normals[facing])
 
     def shape(self, object_frame: str, source: str) -> ObjectShape:
         """The largest connected piece of the surface, with its colours."""
@@ -219,10 +233,22 @@ class _Model:
         if len(counts):
             mesh.remove_triangles_by_mask(np.asarray(labels) != int(np.argmax(counts)))
             mesh.remove_unreferenced_vertices()
-        rgb = np.clip(np.asarray(mesh.vertex_colors) * 255 + 0.5, 0, 255).astype(np.uint8)
-        vertices = np.asarray(mesh.vertices, dtype=np.float64)
-        faces = np.asarray(mesh.triangles, dtype=np.int64)
-        return ObjectShape(object_frame, source, vertices, faces, rgb, np.ones(len(vertices), dtype=bool))
+        vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.triangles, dtype=np.int64)
+        order = np.lexsort(vertices.T)  # Open3D's threads leave vertices and faces in any order
+        rank = np.empty_like(order)
+        rank[order] = np.arange(len(order))
+        faces = _ordered_faces(rank[faces])
+        rgb = np.clip(np.asarray(mesh.vertex_colors)[order] * 255 + 0.5, 0, 255).astype(np.uint8)
+        return ObjectShape(object_frame, source, vertices[order], faces, rgb, np.ones(len(order), dtype=bool))
+
+
+def _ordered_faces(faces: Int[Array, "f 3"]) -> Int[Array, "f 3"]:
+    """Each face from its smallest vertex on, faces in order of their vertices; the winding stays."""
+    if len(faces) == 0:
+        return faces
+    first = faces.argmin(1)
+    turned = np.take_along_axis(faces, (first[:, None] + np.arange(3)) % 3, 1)
+    return turned[np.lexsort(turned.T[::-1])]
 
 
 def _start_pose(view: _View) -> Float[Array, "4 4"]:
@@ -238,53 +264,94 @@ def _align(
     """Pose of a view by ICP to the model, and its covariance; None where too little agrees."""
     step = max(1, len(view.points_m) // s.most_points)
     points = view.points_m[::step]
-    best: tuple[float, Float[Array, "4 4"], Any, Any] | None = None
+    best: tuple[float, _Fit, Surface] | None = None
     for start in starts:
-        cloud = model.facing(start)
-        if len(cloud.points) < s.least_points:
+        surface = model.facing(start)
+        if len(surface.points_m) < s.least_points:
             continue
-        result = _icp(points, cloud, np.linalg.inv(start), s)
-        score = result.fitness - result.inlier_rmse / s.fine_m * 0.2
-        if np.isfinite(result.transformation).all() and (best is None or score > best[0]):
-            best = (score, np.linalg.inv(result.transformation), result, cloud)
-        if best is not None and best[2].fitness >= s.sure_fitness:
+        fit = align_to_surface(points, surface, np.linalg.inv(start), s)
+        score = fit.fitness - 0.2 * fit.rmse_m / s.fine_m
+        if best is None or score > best[0]:
+            best = (score, fit, surface)
+        if best[1].fitness >= s.sure_fitness:
             break
-    if best is None or best[2].fitness < s.least_fitness:
+    if best is None or best[1].fitness < s.least_fitness:
         return None
-    _, pose, result, cloud = best
+    _, fit, surface = best
+    pose = np.linalg.inv(fit.object_from_camera)
     pose[:3, :3] = nearest_rotation(pose[:3, :3])
-    return pose, _covariance(
-        points, cloud, np.asarray(result.correspondence_set), pose, result.inlier_rmse * step**-0.5
-    )
+    return pose, covariance_of(points[fit.pairs[:, 0]], surface.normals[fit.pairs[:, 1]], pose, fit.rmse_m * step**-0.5)
 
 
-def _icp(
-    points_m: Float[Array, "n 3"], cloud: Any, object_from_camera: Float[Array, "4 4"], s: FrameToModelSettings
-) -> Any:
-    """Two rounds of point-to-plane ICP of camera points to the model's points."""
-    import open3d
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """Where ICP ended. `pairs`: position of a frame's point and of the model's, within the fine reach."""
 
-    registration = open3d.pipelines.registration
-    source = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points_m))
+    object_from_camera: Float[Array, "4 4"]
+    fitness: float
+    rmse_m: float
+    pairs: Int[Array, "k 2"]
+
+
+def align_to_surface(
+    points_m: Float[Array, "n 3"], surface: Surface, object_from_camera: Float[Array, "4 4"], s: FrameToModelSettings
+) -> _Fit:
+    """Two rounds of ICP of camera points to the model: Gauss-Newton on point-to-plane residuals (Chen, Medioni 1992).
+
+    A share of point-to-point residuals holds the directions in which the surface slides along itself.
+    """
+    tree = cKDTree(surface.points_m)
     at = object_from_camera
-    for reach, most in ((s.coarse_m, 40), (s.fine_m, 30)):
-        plane = registration.TransformationEstimationPointToPlane()
-        stop = registration.ICPConvergenceCriteria(1e-6, 1e-6, most)
-        result = registration.registration_icp(source, cloud, reach, at, plane, stop)
-        at = result.transformation
-    return result
+    for reach, most, part in ((s.coarse_m, 20, points_m[::3]), (s.fine_m, 20, points_m)):
+        for _ in range(most):
+            moved = part @ at[:3, :3].T + at[:3, 3]
+            distance, nearest = tree.query(moved, distance_upper_bound=reach)
+            near = np.isfinite(distance)
+            if near.sum() < 10:
+                break
+            step = _gauss_newton(moved[near], surface, nearest[near], s.point_share)
+            at = _exp(step) @ at
+            if float(np.abs(step).max()) < s.still:
+                break
+    moved = points_m @ at[:3, :3].T + at[:3, 3]
+    distance, nearest = tree.query(moved, distance_upper_bound=s.fine_m)
+    near = np.flatnonzero(np.isfinite(distance))
+    pairs = np.stack([near, nearest[near]], -1)
+    off = ((moved[near] - surface.points_m[pairs[:, 1]]) * surface.normals[pairs[:, 1]]).sum(1)
+    rmse = float(np.sqrt(np.mean(off**2))) if len(off) else np.inf
+    return _Fit(at, len(near) / len(points_m), rmse, pairs)
 
 
-def _covariance(
-    points_m: Float[Array, "n 3"], cloud: Any, pairs: Any, pose: Float[Array, "4 4"], sigma_m: float
+def _gauss_newton(
+    moved_m: Float[Array, "k 3"], surface: Surface, nearest: Int[Array, " k"], point_share: float
+) -> Float[Array, "6"]:
+    """The step (rotation vector, translation) that brings moved points onto the planes of their nearest points."""
+    normals, gap = surface.normals[nearest], moved_m - surface.points_m[nearest]
+    rows = np.hstack([np.cross(moved_m, normals), normals])
+    hessian = rows.T @ rows
+    gradient = rows.T @ (gap * normals).sum(1)
+    for axis in np.eye(3) if point_share > 0 else ():
+        towards = np.hstack([np.cross(moved_m, axis), np.broadcast_to(axis, moved_m.shape)])
+        hessian += point_share * towards.T @ towards
+        gradient += point_share * towards.T @ (gap @ axis)
+    return -np.linalg.solve(hessian + 1e-9 * np.trace(hessian) * np.eye(6), gradient)
+
+
+def _exp(step: Float[Array, "6"]) -> Float[Array, "4 4"]:
+    out = np.eye(4)
+    out[:3, :3], out[:3, 3] = rotation_exp(step[:3]), step[3:]
+    return out
+
+
+def covariance_of(
+    points_m: Float[Array, "k 3"], normals_object: Float[Array, "k 3"], pose: Float[Array, "4 4"], sigma_m: float
 ) -> Float[Array, "6 6"]:
     """Inverse of the Gauss-Newton Hessian of the point-to-plane residuals, in the camera frame.
 
     The pose moves as (exp(w) R, t + d); a point x on a plane with normal n gives the row [(x - t) x n, n] for (w, d).
     `sigma_m` is per pixel of the whole image, thinning taken out. Directions that no plane holds stay at 1 rad, 1 m.
     """
-    normals = np.asarray(cloud.normals)[pairs[:, 1]] @ pose[:3, :3].T
-    arms = points_m[pairs[:, 0]] - pose[:3, 3]
-    rows = np.hstack([np.cross(arms, normals), normals])
+    normals = normals_object @ pose[:3, :3].T
+    rows = np.hstack([np.cross(points_m - pose[:3, 3], normals), normals])
     information = rows.T @ rows / (CORRELATED_PX * max(sigma_m, 1e-4) ** 2)
     return np.linalg.inv(information + np.eye(6))

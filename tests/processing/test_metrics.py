@@ -1,0 +1,124 @@
+"""Metrics against known answers, and against the independent scorer where it is at hand."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given
+from hypothesis import strategies as st
+
+from processing.metrics import align_first, auc_percent, chamfer, frame_errors, icp_align, surface_points
+from recordings.geometry import rotation_exp
+
+CORNERS_M = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * 0.05
+
+
+def pose(
+    turn_rad: tuple[float, float, float] = (0, 0, 0), at_m: tuple[float, float, float] = (0, 0, 0.8)
+) -> np.ndarray:
+    out = np.eye(4)
+    out[:3, :3], out[:3, 3] = rotation_exp(np.array(turn_rad, dtype=np.float64)), at_m
+    return out
+
+
+def test_add_of_a_pure_shift_is_its_length() -> None:
+    errors = frame_errors(pose(at_m=(0.03, 0.04, 0.8))[None], pose()[None], CORNERS_M)
+    assert errors.add_m[0] == pytest.approx(0.05)
+    assert errors.translation_m[0] == pytest.approx(0.05)
+    assert errors.rotation_deg[0] == pytest.approx(0)
+
+
+def test_add_s_forgives_a_cubes_quarter_turn_and_add_does_not() -> None:
+    errors = frame_errors(pose((0, 0, np.pi / 2))[None], pose()[None], CORNERS_M)
+    assert errors.adds_m[0] == pytest.approx(0, abs=1e-12)
+    assert errors.add_m[0] == pytest.approx(0.1)
+    assert errors.rotation_deg[0] == pytest.approx(90)
+    assert errors.success[0] == 0
+
+
+def test_a_lost_frame_is_an_infinite_error_and_a_frame_without_truth_is_none() -> None:
+    estimate, truth = np.stack([pose(), np.full((4, 4), np.nan), pose()]), np.stack([pose()] * 3)
+    truth[2] = np.nan
+    errors = frame_errors(estimate, truth, CORNERS_M)
+    assert errors.add_m.tolist() == [0.0, np.inf]
+    assert errors.success.tolist() == [1.0, 0.0]
+
+
+def test_auc_of_known_errors() -> None:
+    assert auc_percent(np.zeros(50)) == pytest.approx(100)
+    assert auc_percent(np.full(50, 0.2)) == 0
+    assert auc_percent(np.full(50, np.inf)) == 0
+    assert auc_percent(np.array([0.0, np.inf])) == pytest.approx(50)
+
+
+@given(st.lists(st.floats(0, 0.2), min_size=200, max_size=300))
+def test_auc_is_the_mean_of_what_is_left_of_the_limit_up_to_one_frame(errors: list[float]) -> None:
+    e = np.array(errors)
+    mean = 100 * np.clip(1 - e / 0.1, 0, 1).mean()
+    assert mean - 1e-9 <= auc_percent(e) <= mean + 100 / len(e)
+
+
+def test_alignment_by_the_first_common_frame_takes_the_object_frame_away() -> None:
+    truth = np.stack([pose(), pose((0.2, 0.1, 0), (0.1, 0, 0.7)), pose((0.5, 0, 0), (0.1, 0.2, 0.7))])
+    offset = pose((1.0, -0.4, 0.3), (0.02, 0.01, 0.03))
+    estimate = truth @ offset
+    estimate[0] = np.nan
+    shift = align_first(estimate, truth)
+    assert shift is not None
+    np.testing.assert_allclose((estimate @ shift)[1:], truth[1:], atol=1e-12)
+
+
+def test_chamfer_of_a_larger_box_is_its_margin() -> None:
+    small, large = trimesh.creation.box((0.1, 0.1, 0.1)), trimesh.creation.box((0.102, 0.102, 0.102))
+    found = chamfer(large, small)
+    assert found.truth_to_estimate_m == pytest.approx(0.001, abs=2e-5)
+    assert found.cm == pytest.approx(0.1, abs=0.01)
+    assert found.f_score_5mm == 1
+    assert chamfer(small, small).cm < 1e-5
+
+
+def test_icp_finds_a_small_motion_back() -> None:
+    points = surface_points(trimesh.creation.box((0.1, 0.08, 0.05)), 4000)
+    moved = pose((0.05, 0.02, -0.04), (0.003, -0.002, 0.004))
+    there = points @ moved[:3, :3].T + moved[:3, 3]
+    np.testing.assert_allclose(icp_align(points, there, share=1.0), moved, atol=2e-3)
+
+
+def test_our_scores_are_those_of_the_independent_scorer(data: Callable[[str], Path], tmp_path: Path) -> None:
+    """Truth with small errors put in, one lost frame and a wrong first pose's frame: both scorers say the same."""
+    truth_folder = data("cube_dev_truth")
+    scorer = truth_folder.parent.parent / "score" / "score.py"
+    if not scorer.exists():
+        pytest.skip(f"no {scorer}")
+    from scipy.spatial.transform import Rotation
+
+    rng = np.random.default_rng(3)
+    mesh = trimesh.load(truth_folder / "mesh.obj", force="mesh", process=False)
+    points, errors = surface_points(mesh, 2000), []
+    for folder in sorted(truth_folder.glob("toss_*")):
+        stored = np.load(folder / "poses_camera_object.npz", allow_pickle=False)
+        truth, lines = stored["T_camera_object"], []
+        noise = np.stack([pose(tuple(rng.normal(0, 0.03, 3)), tuple(rng.normal(0, 0.01, 3))) for _ in truth])
+        estimate = truth @ noise @ pose((0.4, 0.2, 0.1), (0.01, 0.02, 0.03))
+        estimate[5] = np.nan
+        for time_s, e in zip(stored["t"], estimate):
+            q = Rotation.from_matrix(e[:3, :3]).as_quat() if np.isfinite(e).all() else np.full(4, np.nan)
+            lines.append(" ".join(f"{x:.12g}" for x in (time_s, *e[:3, 3], *q)))
+        (tmp_path / f"{folder.name}.txt").write_text("\n".join(lines))
+        shift = align_first(estimate, truth)
+        assert shift is not None
+        errors.append(frame_errors(estimate @ shift, truth, points))
+    command = [sys.executable, str(scorer), str(truth_folder), str(tmp_path), "--json", str(tmp_path / "out.json")]
+    subprocess.run(command, check=True, capture_output=True)
+    total = json.loads((tmp_path / "out.json").read_text())["total"]
+    add, adds = (np.concatenate([getattr(e, n) for e in errors]) for n in ("add_m", "adds_m"))
+    assert auc_percent(add) == pytest.approx(total["add_auc"], abs=0.1)
+    assert auc_percent(adds) == pytest.approx(total["adds_auc"], abs=0.1)
+    assert 100 * np.concatenate([e.success for e in errors]).mean() == pytest.approx(total["success"], abs=0.1)
