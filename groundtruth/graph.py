@@ -1,0 +1,434 @@
+"""A factor graph over poses: tag corners, priors, relative poses and measured lengths, solved by Levenberg-Marquardt.
+
+The model is TagSLAM's (Pfrommer and Daniilidis 2019): a corner of a tag on a body, seen by a camera on a rig,
+
+    pixel = project( rig_from_camera^-1  world_from_rig^-1  world_from_body  body_from_tag  corner )
+
+with every pose a variable. All factors of a kind are linearised at once in numpy and the sparse normal equations are
+factorised by SuperLU: a Python callback per factor, as GTSAM's bindings would need, costs fifty times as much. What
+TagSLAM lacks: pixel residuals are robust (Huber), and a variable that nothing determines is named.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float, Int
+from numpy import ndarray as Array
+from scipy import sparse
+from scipy.sparse.linalg import splu
+
+from groundtruth import se3
+from recordings.errors import TosslabError
+from recordings.geometry import CameraModel
+
+CORNERS = np.array([[-0.5, -0.5, 0.0], [0.5, -0.5, 0.0], [0.5, 0.5, 0.0], [-0.5, 0.5, 0.0]])
+"""Corners of a tag of size 1 in TagSLAM's tag frame (y up on the printed tag)."""
+
+
+class Undetermined(TosslabError):
+    """The graph does not fix some pose. `names` says whose."""
+
+    exit_code = 1
+
+    def __init__(self, names: Sequence[str], why: str) -> None:
+        self.names = tuple(names)
+        super().__init__(f"the solution is singular: {why} ({', '.join(self.names[:8])})")
+
+
+@dataclass(frozen=True)
+class SolverConfig:
+    iterations: int = 60
+    """Levenberg-Marquardt steps at most."""
+    huber_px: float | None = 3.0
+    """Pixel residuals beyond this many standard deviations count linearly; None as TagSLAM, which trusts all."""
+    least_gain: float = 1e-9
+    """Stops when a step lowers the cost by less than this share."""
+    weakest: float = 1e-3
+    """A pose whose information (in 1/rad^2 or 1/m^2) is below this in some direction is not determined."""
+
+
+@dataclass(frozen=True)
+class Projection:
+    """One tag seen by one camera: indices of the four poses in the chain, and the corners (4, 2) in pixels."""
+
+    camera: int
+    rig_from_camera: int
+    world_from_rig: int
+    world_from_body: int
+    body_from_tag: int
+    size_m: float
+    corners_px: Float[Array, "4 2"]
+    sigma_px: float
+
+
+@dataclass(frozen=True)
+class Prior:
+    pose: int
+    mean: Float[Array, "4 4"]
+    root_information: Float[Array, "6 6"]
+
+
+@dataclass(frozen=True)
+class Between:
+    """pose_a^-1 pose_b is about `delta`."""
+
+    pose_a: int
+    pose_b: int
+    delta: Float[Array, "4 4"]
+    root_information: Float[Array, "6 6"]
+
+
+@dataclass(frozen=True)
+class Coordinate:
+    """direction . (world point of a tag's corner, or of its centre for corner -1) is about `length_m`."""
+
+    world_from_body: int
+    body_from_tag: int
+    point_tag_m: Float[Array, "3"]
+    direction: Float[Array, "3"]
+    length_m: float
+    sigma_m: float
+
+
+@dataclass(frozen=True)
+class Distance:
+    """The distance between two points on tags is about `length_m`."""
+
+    world_from_body: tuple[int, int]
+    body_from_tag: tuple[int, int]
+    points_tag_m: tuple[Float[Array, "3"], Float[Array, "3"]]
+    length_m: float
+    sigma_m: float
+
+
+@dataclass
+class Graph:
+    """Poses by index with their names, and the factors between them."""
+
+    cameras: list[CameraModel]
+    names: list[str] = field(default_factory=list)
+    start: list[Float[Array, "4 4"]] = field(default_factory=list)
+    stamps: list[int | None] = field(default_factory=list)
+    projections: list[Projection] = field(default_factory=list)
+    priors: list[Prior] = field(default_factory=list)
+    betweens: list[Between] = field(default_factory=list)
+    coordinates: list[Coordinate] = field(default_factory=list)
+    distances: list[Distance] = field(default_factory=list)
+
+    def add_pose(self, name: str, start: Float[Array, "4 4"], stamp_ns: int | None) -> int:
+        """`stamp_ns` is None for what does not move: such poses are eliminated last, everything else in time order."""
+        self.names.append(name)
+        self.stamps.append(stamp_ns)
+        self.start.append(np.asarray(start, dtype=np.float64))
+        return len(self.names) - 1
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """`poses` (n, 4, 4); `reprojection_px` (m, 4) corner distances in pixels by projection; `iterations` used."""
+
+    poses: Float[Array, "n 4 4"]
+    reprojection_px: Float[Array, "m 4"]
+    cost: float
+    iterations: int
+    information: sparse.csc_matrix
+    order: Int[Array, " d"]
+
+
+def solve(graph: Graph, config: SolverConfig) -> Solution:
+    """Minimise the graph's cost from its start. Raises Undetermined where a pose is not fixed."""
+    system, order = _System(graph, config), elimination_order(graph)
+    poses = np.stack(graph.start)
+    damping, cost, used = 1e-6, system.cost(poses), 0
+    information, right = system.normal_equations(poses)
+    for used in range(1, config.iterations + 1):  # noqa: B007 told in the solution
+        step = _damped_step(graph, information, right, damping, order)
+        candidate = poses @ se3.exp(step.reshape(-1, 6))
+        new_cost = system.cost(candidate)
+        if not new_cost <= cost:
+            damping = max(damping * 10, 1e-6)
+            if damping > 1e8:
+                break
+            continue
+        gain = (cost - new_cost) / max(cost, 1e-12)
+        poses, cost, damping = candidate, new_cost, max(damping / 10, 1e-9)
+        information, right = system.normal_equations(poses)
+        if gain < config.least_gain:
+            break
+    _check_determined(graph, information, config, order)
+    return Solution(poses, system.corner_distances(poses), cost, used, information, order)
+
+
+def covariances(solution: Solution, poses: Sequence[int]) -> Float[Array, "k 6 6"]:
+    """Marginal covariance of each pose, (rotation, translation) in its own frame."""
+    factor = Factor(solution.information, solution.order)
+    out = np.empty((len(poses), 6, 6))
+    for i, pose in enumerate(poses):
+        unit = np.zeros((solution.information.shape[0], 6))
+        unit[6 * pose : 6 * pose + 6] = np.eye(6)
+        out[i] = factor.solve(unit)[6 * pose : 6 * pose + 6]
+    return out
+
+
+def elimination_order(graph: Graph) -> Int[Array, " d"]:
+    """Unknowns in the order of elimination: by time, what does not move last. No fill but in the last rows."""
+    stamps = np.array([np.iinfo(np.int64).max if s is None else s for s in graph.stamps], dtype=np.int64)
+    poses = np.argsort(stamps, kind="stable")
+    return (6 * poses[:, None] + np.arange(6)).ravel()
+
+
+class Factor:
+    """A symmetric positive matrix, factorised in a given order of elimination. Raises RuntimeError where singular."""
+
+    def __init__(self, matrix: sparse.spmatrix, order: Int[Array, " d"]) -> None:
+        self._order = order
+        permuted = matrix.tocsr()[order][:, order].tocsc()
+        self._lu = splu(permuted, permc_spec="NATURAL", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+
+    def solve(self, right: Float[Array, "*d"]) -> Float[Array, "*d"]:
+        out = np.empty_like(right)
+        out[self._order] = self._lu.solve(right[self._order])
+        return out
+
+
+def _damped_step(
+    graph: Graph, information: sparse.csc_matrix, right: Float[Array, " d"], damping: float, order: Int[Array, " d"]
+) -> Float[Array, " d"]:
+    diagonal = information.diagonal()
+    if not np.isfinite(diagonal).all() or (diagonal <= 0).any():
+        bad = sorted({graph.names[i // 6] for i in np.flatnonzero(~(diagonal > 0))})
+        raise Undetermined(bad, "no factor touches a pose")
+    try:
+        factor = Factor(information + sparse.diags(damping * diagonal), order)
+    except RuntimeError as singular:
+        raise Undetermined([_weakest_name(graph, information)], "the normal equations cannot be solved") from singular
+    return factor.solve(right)
+
+
+def _check_determined(
+    graph: Graph, information: sparse.csc_matrix, config: SolverConfig, order: Int[Array, " d"]
+) -> None:
+    """Find directions that nothing holds, by inverse iteration on the smallest eigenvalue of the scaled information."""
+    scale = 1 / np.sqrt(np.maximum(information.diagonal(), 1e-12))
+    scaled = sparse.diags(scale) @ information @ sparse.diags(scale)
+    try:
+        factor = Factor(scaled + 1e-14 * sparse.eye(len(scale)), order)
+    except RuntimeError as singular:
+        raise Undetermined([_weakest_name(graph, information)], "the normal equations cannot be solved") from singular
+    v = np.random.default_rng(0).normal(size=len(scale))
+    for _ in range(6):
+        v = factor.solve(v)
+        v /= np.linalg.norm(v)
+    direction = scale * v
+    direction /= np.linalg.norm(direction)
+    weakest = float(direction @ (information @ direction))
+    if weakest < config.weakest:
+        share = np.abs(direction).reshape(-1, 6).max(1)
+        names = [graph.names[i] for i in np.argsort(-share)[:4] if share[i] > 0.3 * share.max()]
+        raise Undetermined(names, f"a direction has an information of only {weakest:.1e}")
+
+
+def _weakest_name(graph: Graph, information: sparse.csc_matrix) -> str:
+    return graph.names[int(np.argmin(information.diagonal())) // 6]
+
+
+class _System:
+    """The graph's factors as arrays, evaluated all at once."""
+
+    def __init__(self, graph: Graph, config: SolverConfig) -> None:
+        self._graph = graph
+        self._config = config
+        p = graph.projections
+        self._chain = np.array(
+            [[q.rig_from_camera, q.world_from_rig, q.world_from_body, q.body_from_tag] for q in p], dtype=np.int64
+        ).reshape(-1, 4)
+        self._camera = np.array([q.camera for q in p], dtype=np.int64)
+        self._corners = np.stack([q.size_m * CORNERS for q in p]) if p else np.zeros((0, 4, 3))
+        self._seen = np.stack([q.corners_px for q in p]) if p else np.zeros((0, 4, 2))
+        self._sigma = np.array([q.sigma_px for q in p])
+
+    def cost(self, poses: Float[Array, "n 4 4"]) -> float:
+        total = 0.0
+        if len(self._chain):
+            residual = self._pixels(poses)[0]
+            total += float(self._robust(np.linalg.norm(residual, axis=-1) / self._sigma[:, None])[0].sum())
+        for residuals, *_ in self._others(poses):
+            total += 0.5 * float((residuals**2).sum())
+        return total if np.isfinite(total) else np.inf
+
+    def corner_distances(self, poses: Float[Array, "n 4 4"]) -> Float[Array, "m 4"]:
+        return np.linalg.norm(self._pixels(poses)[0], axis=-1)
+
+    def normal_equations(self, poses: Float[Array, "n 4 4"]) -> tuple[sparse.csc_matrix, Float[Array, " d"]]:
+        """J' W J and -J' W r over all factors."""
+        blocks = _Blocks(len(poses))
+        if len(self._chain):
+            residual, jacobians = self._linearised(poses)
+            weight = self._robust(np.linalg.norm(residual, axis=-1) / self._sigma[:, None])[1]
+            root = np.sqrt(weight) / self._sigma[:, None]
+            residual = (residual * root[..., None]).reshape(len(residual), 8)
+            scaled = [(J * root[..., None, None]).reshape(len(residual), 8, 6) for J in jacobians]
+            blocks.add(self._chain, scaled, residual)
+        for residuals, jacobians_of, indices in self._others(poses):
+            blocks.add(indices, jacobians_of, residuals)
+        return blocks.build()
+
+    def _pixels(self, poses: Float[Array, "n 4 4"]) -> tuple[Array, Array, Array, Array]:
+        """Residuals (m, 4, 2), points in the body, rig and camera frames (m, 4, 3)."""
+        camera, rig, body, tag = (poses[self._chain[:, i]] for i in range(4))
+        in_body = _move(tag, self._corners)
+        in_rig = _move(se3.inverse(rig), _move(body, in_body))
+        in_camera = _move(se3.inverse(camera), in_rig)
+        return self._project(in_camera) - self._seen, in_body, in_rig, in_camera
+
+    def _project(self, points: Float[Array, "m k 3"]) -> Float[Array, "m k 2"]:
+        """Pixels; points at or behind the camera give a huge residual instead of none."""
+        safe = points.copy()
+        safe[..., 2] = np.maximum(safe[..., 2], 0.01)
+        out = np.empty((*points.shape[:2], 2))
+        for number, camera in enumerate(self._graph.cameras):
+            mine = self._camera == number
+            out[mine] = camera.project(safe[mine])
+        return out
+
+    def _linearised(self, poses: Float[Array, "n 4 4"]) -> tuple[Array, list[Array]]:
+        """Residuals and their Jacobians (m, 4, 2, 6) by the four poses of the chain."""
+        residual, in_body, in_rig, in_camera = self._pixels(poses)
+        h = 1e-6 * np.maximum(in_camera[..., 2:], 0.05)
+        columns = []
+        for axis in np.eye(3):
+            columns.append((self._project(in_camera + h * axis) - self._project(in_camera - h * axis)) / (2 * h))
+        by_point = np.stack(columns, axis=-1)  # (m, 4, 2, 3)
+        camera, rig, body, tag = (poses[self._chain[:, i]][:, None, :3, :3] for i in range(4))
+        turn_camera = np.swapaxes(camera, -1, -2)
+        turn_rig = turn_camera @ np.swapaxes(rig, -1, -2)
+        identity = np.broadcast_to(np.eye(3), (*in_rig.shape, 3))
+        by_camera = np.concatenate([se3.skew(in_camera), -identity], -1)
+        by_rig = turn_camera @ np.concatenate([se3.skew(in_rig), -identity], -1)
+        by_body = turn_rig @ body @ np.concatenate([-se3.skew(in_body), identity], -1)
+        by_tag = turn_rig @ body @ tag @ np.concatenate([-se3.skew(self._corners), identity], -1)
+        return residual, [by_point @ J for J in (by_camera, by_rig, by_body, by_tag)]
+
+    def _robust(self, scaled: Float[Array, "m 4"]) -> tuple[Float[Array, "m 4"], Float[Array, "m 4"]]:
+        """Huber's cost and weight of residuals in standard deviations."""
+        k = self._config.huber_px
+        if k is None:
+            return 0.5 * scaled**2, np.ones_like(scaled)
+        far = scaled > k
+        cost = np.where(far, k * scaled - 0.5 * k * k, 0.5 * scaled**2)
+        return cost, np.where(far, k / np.maximum(scaled, 1e-12), 1.0)
+
+    def _others(self, poses: Float[Array, "n 4 4"]) -> list[tuple[Array, list[Array], Int[Array, "m k"]]]:
+        """Whitened residuals (m, d), Jacobians (m, d, 6) by pose, and the poses' indices, of all other factors."""
+        out = []
+        if self._graph.priors:
+            out.append(_prior_terms(self._graph.priors, poses))
+        if self._graph.betweens:
+            out.append(_between_terms(self._graph.betweens, poses))
+        if self._graph.coordinates:
+            out.append(_coordinate_terms(self._graph.coordinates, poses))
+        if self._graph.distances:
+            out.append(_distance_terms(self._graph.distances, poses))
+        return out
+
+
+def _prior_terms(priors: list[Prior], poses: Array) -> tuple[Array, list[Array], Array]:
+    index = np.array([[p.pose] for p in priors])
+    root = np.stack([p.root_information for p in priors])
+    mean = np.stack([p.mean for p in priors])
+    error = se3.log(se3.inverse(mean) @ poses[index[:, 0]])
+    return (root @ error[..., None])[..., 0], [root @ _right_jacobian_inverse(error)], index
+
+
+def _between_terms(betweens: list[Between], poses: Array) -> tuple[Array, list[Array], Array]:
+    index = np.array([[b.pose_a, b.pose_b] for b in betweens])
+    root = np.stack([b.root_information for b in betweens])
+    delta = np.stack([b.delta for b in betweens])
+    relative = se3.inverse(poses[index[:, 0]]) @ poses[index[:, 1]]
+    error = se3.log(se3.inverse(delta) @ relative)
+    by_b = root @ _right_jacobian_inverse(error)
+    by_a = -by_b @ se3.adjoint(se3.inverse(relative))
+    return (root @ error[..., None])[..., 0], [by_a, by_b], index
+
+
+def _right_jacobian_inverse(error: Float[Array, "n 6"]) -> Float[Array, "n 6 6"]:
+    """Inverse right Jacobian of SE(3) to second order: I + ad/2 + ad^2/12; exact enough below a radian."""
+    ad = np.zeros((len(error), 6, 6))
+    w, v = se3.skew(error[:, :3]), se3.skew(error[:, 3:])
+    ad[:, :3, :3], ad[:, 3:, 3:], ad[:, 3:, :3] = w, w, v
+    return np.eye(6) + 0.5 * ad + ad @ ad / 12
+
+
+def _coordinate_terms(items: list[Coordinate], poses: Array) -> tuple[Array, list[Array], Array]:
+    index = np.array([[c.world_from_body, c.body_from_tag] for c in items])
+    direction = np.stack([c.direction for c in items])[:, None, :]
+    points = np.stack([c.point_tag_m for c in items])[:, None, :]
+    sigma = np.array([c.sigma_m for c in items])
+    world, (by_body, by_tag) = _world_point(poses[index[:, 0]], poses[index[:, 1]], points)
+    residual = ((direction[:, 0] * world).sum(-1) - np.array([c.length_m for c in items])) / sigma
+    scale = 1 / sigma[:, None, None]
+    return residual[:, None], [direction @ by_body * scale, direction @ by_tag * scale], index
+
+
+def _distance_terms(items: list[Distance], poses: Array) -> tuple[Array, list[Array], Array]:
+    index = np.array(
+        [[d.world_from_body[0], d.body_from_tag[0], d.world_from_body[1], d.body_from_tag[1]] for d in items]
+    )
+    sigma = np.array([d.sigma_m for d in items])
+    ends, jacobians = [], []
+    for i in (0, 1):
+        points = np.stack([d.points_tag_m[i] for d in items])[:, None, :]
+        world, J = _world_point(poses[index[:, 2 * i]], poses[index[:, 2 * i + 1]], points)
+        ends.append(world)
+        jacobians.append(J)
+    gap = ends[1] - ends[0]
+    length = np.linalg.norm(gap, axis=-1)
+    along = (gap / np.maximum(length, 1e-9)[:, None] / sigma[:, None])[:, None, :]
+    residual = (length - np.array([d.length_m for d in items])) / sigma
+    out = [-along @ jacobians[0][0], -along @ jacobians[0][1], along @ jacobians[1][0], along @ jacobians[1][1]]
+    return residual[:, None], out, index
+
+
+def _world_point(body: Array, tag: Array, points: Float[Array, "n 1 3"]) -> tuple[Array, tuple[Array, Array]]:
+    """World position (n, 3) of a point of a tag, and its Jacobians (n, 3, 6) by body and tag."""
+    in_body = _move(tag, points)
+    world = _move(body, in_body)[:, 0]
+    identity = np.broadcast_to(np.eye(3), (len(points), 3, 3))
+    by_body = body[:, :3, :3] @ np.concatenate([-se3.skew(in_body[:, 0]), identity], -1)
+    by_tag = body[:, :3, :3] @ tag[:, :3, :3] @ np.concatenate([-se3.skew(points[:, 0]), identity], -1)
+    return world, (by_body, by_tag)
+
+
+def _move(poses: Float[Array, "m 4 4"], points: Float[Array, "m k 3"]) -> Float[Array, "m k 3"]:
+    return points @ np.swapaxes(poses[:, :3, :3], -1, -2) + poses[:, None, :3, 3]
+
+
+class _Blocks:
+    """Sums of 6x6 blocks of the normal equations."""
+
+    def __init__(self, poses: int) -> None:
+        self._size = 6 * poses
+        self._rows: list[Array] = []
+        self._columns: list[Array] = []
+        self._values: list[Array] = []
+        self._right = np.zeros((poses, 6))
+
+    def add(self, index: Int[Array, "m k"], jacobians: list[Array], residual: Float[Array, "m d"]) -> None:
+        within = np.arange(6)
+        for i, A in enumerate(jacobians):
+            transposed = np.swapaxes(A, -1, -2)
+            np.add.at(self._right, index[:, i], -(transposed @ residual[..., None])[..., 0])
+            for j, B in enumerate(jacobians):
+                block = transposed @ B
+                rows = 6 * index[:, i, None, None] + within[:, None]
+                columns = 6 * index[:, j, None, None] + within[None, :]
+                self._rows.append(np.broadcast_to(rows, block.shape).ravel())
+                self._columns.append(np.broadcast_to(columns, block.shape).ravel())
+                self._values.append(block.ravel())
+
+    def build(self) -> tuple[sparse.csc_matrix, Float[Array, " d"]]:
+        values, rows, columns = (np.concatenate(x) for x in (self._values, self._rows, self._columns))
+        return sparse.csc_matrix((values, (rows, columns)), shape=(self._size, self._size)), self._right.ravel()
