@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from recordings.documents import as_dict, json_object, read_document
+from recordings.documents import as_dict, json_object, mapping, read_document
 from recordings.errors import BadInput, TosslabError, WriteFailed
 from recordings.mcap_file import McapFile
 from recordings.progress import Progress, Silent
@@ -123,12 +123,14 @@ def _in_words(report: Recovered) -> str:
 def _document(source: Path, reports: list[Recovered], out: Path) -> Mapping[str, Any]:
     """session.json, or where it cannot be read the start document that every file carries."""
     try:
-        return read_document(source / "session.json")
+        document = read_document(source / "session.json")
+        mapping(document.get("start"), "start")
+        return document
     except BadInput:
         for report in reports:
             data = _attached(out / report.out, "session.json") if report.out else None
             if data is not None:
-                return {"start": json_object(data).get("start")}
+                return {"start": as_dict(json_object(data).get("start"))}
     return {"start": {}}
 
 

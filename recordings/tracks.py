@@ -162,10 +162,10 @@ class RigCalibration:
                     for t in data.get("table_tags", [])
                 ),
                 tag_family=data.get("tag_family", "tag36h11"),
-                created_unix_s=data.get("created_unix_s"),
-                residuals=data.get("residuals", {}),
+                created_unix_s=None if data.get("created_unix_s") is None else float(data["created_unix_s"]),
+                residuals=dict(data.get("residuals") or {}),
             )
-        except (KeyError, TypeError, ValueError, AttributeError) as wrong:
+        except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as wrong:
             raise BadInput(
                 f"calibration: {type(wrong).__name__}: {wrong}; see ARCHITECTURE.md for the format"
             ) from wrong

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,10 +15,13 @@ from mcap.writer import Writer as PlainWriter
 from recordings.codec import decode_image
 from recordings.errors import BadInput, DamagedFile, TosslabError, WriteFailed
 from recordings.geometry import CameraModel, Transform
+from recordings.inspect import inspect
 from recordings.records import EncodedImage, TossWindow
+from recordings.recover_session import recover
 from recordings.session import Session
 from recordings.session_writer import SessionWriter, TossWriter
 from recordings.tracks import RigCalibration
+from recordings.verify import verify
 
 
 def test_every_record_comes_back_as_it_was_written(write_session, small_rig):
@@ -302,3 +307,42 @@ def test_session_json_is_written_whole_or_not_at_all(tmp_path, small_rig, monkey
     assert (tmp_path / "s" / "session.json").read_text() == before
     assert json.loads(before)["stop"] is None
     assert not list((tmp_path / "s").glob("*.partial"))
+
+
+WEIRD = (None, [], {}, "x", -1, 1e400, float("nan"), 10**30, [1, 2], {"a": 1})
+
+
+def places(document: Any, place: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+    yield place
+    inner = (
+        document.items() if isinstance(document, dict) else enumerate(document) if isinstance(document, list) else ()
+    )
+    for key, value in inner:
+        yield from places(value, (*place, key))
+
+
+def put(document: Any, place: tuple[Any, ...], value: Any) -> Any:
+    if not place:
+        return value
+    inner = put(document[place[0]], place[1:], value)
+    if isinstance(document, list):
+        return [inner if i == place[0] else v for i, v in enumerate(document)]
+    return {**document, place[0]: inner}
+
+
+@pytest.mark.parametrize("name", ["session.json", "calibration.json"])
+def test_strange_values_anywhere_in_the_documents_give_plain_errors(write_session, tmp_path, name):
+    folder = write_session()
+    document = json.loads((folder / name).read_text())
+    rng = np.random.default_rng(4)
+    every = list(places(document))
+    for i in range(60):
+        spoilt = put(document, every[int(rng.integers(len(every)))], WEIRD[int(rng.integers(len(WEIRD)))])
+        (folder / name).write_text(json.dumps(spoilt))
+        for work in (lambda: inspect(folder).to_text(), lambda: verify(folder).to_text()):
+            try:
+                work()
+            except TosslabError:
+                pass
+        recover(folder, tmp_path / f"saved_{i}")
+        assert verify(tmp_path / f"saved_{i}").ok
