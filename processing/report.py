@@ -20,6 +20,7 @@ from recordings.session_writer import write_bytes
 from recordings.tracks import ObjectShape
 
 PICTURES = 6
+TILE_PX = 360
 OUTLINE_RGB = (255, 40, 40)
 STYLE = """body{font:15px/1.5 system-ui,sans-serif;max-width:70em;margin:2em auto;padding:0 1em;color:#222}
 table{border-collapse:collapse;margin:1em 0}td,th{border:1px solid #ccc;padding:.25em .6em;text-align:right}
@@ -116,27 +117,41 @@ def _figure(results: Results, row: Row, session: Session) -> str:
 
 
 def outline_picture(results: Results, row: Row, session: Session) -> UInt8[Array, "h w 3"]:
-    """Frames from up to PICTURES tosses (or from one toss alone) with the mesh's outline, side by side."""
+    """Cut-outs of up to PICTURES frames (of three tosses, or of one alone) with the mesh's outline, side by side."""
     tosses = list(row.tracks)
     chosen = [tosses[i] for i in np.unique(np.linspace(0, len(tosses) - 1, min(3, len(tosses))).round().astype(int))]
     tiles = []
     for toss in chosen:
-        track, frames = row.tracks[toss], session.toss(toss).rgbd()
+        track, frames = row.tracks[toss], session.toss(toss).rgbd(row.tracks[toss].camera)
         shape = results.shape(row.record.name, row.record.scope, toss)
         camera = row.record.calibration.camera(track.camera)
-        for share in np.linspace(0.3, 0.95, PICTURES // len(chosen)):
+        for share in np.linspace(0.15, 0.98, PICTURES // len(chosen)):
             position = int(share * (len(frames) - 1))
             image, pose = frames[position].color_rgb.copy(), track.camera_from_object[position]
-            if np.isfinite(pose).all():
-                draw_outline(image, silhouette(shape, pose, camera))
-            cv2.putText(
-                image, f"toss {toss}, frame {position}", (8, 22), cv2.FONT_HERSHEY_SIMPLEX, 0.6, (255, 255, 255), 2
-            )
-            tiles.append(image)
-    columns = 3 if len(tiles) >= 3 else len(tiles)
-    blank = np.zeros_like(tiles[0])
-    tiles += [blank] * (-len(tiles) % columns)
+            seen = silhouette(shape, pose, camera) if np.isfinite(pose).all() else np.zeros(image.shape[:2], dtype=bool)
+            tiles.append(_tile(image, seen, f"toss {toss}, frame {position}"))
+    columns = min(3, len(tiles))
+    tiles += [np.zeros_like(tiles[0])] * (-len(tiles) % columns)
     return np.vstack([np.hstack(tiles[i : i + columns]) for i in range(0, len(tiles), columns)])
+
+
+def _tile(image_rgb: UInt8[Array, "h w 3"], mask: Bool[Array, "h w"], title: str) -> UInt8[Array, "th tw 3"]:
+    """The part of the image around the mask (all of it for an empty one), with the outline and a title."""
+    height, width = mask.shape
+    rows, columns = np.nonzero(mask)
+    half = height // 2
+    center = (height // 2, width // 2)
+    if len(rows):
+        half = int(np.clip(1.3 * max(np.ptp(rows), np.ptp(columns)) / 2 + 8, 20, height // 2))
+        center = (int(np.ptp(rows) / 2 + rows.min()), int(np.ptp(columns) / 2 + columns.min()))
+    top = int(np.clip(center[0] - half, 0, height - 2 * half))
+    left = int(np.clip(center[1] - half, 0, max(0, width - 2 * half)))
+    cut = (slice(top, top + 2 * half), slice(left, left + 2 * half))
+    tile = cv2.resize(image_rgb[cut], (TILE_PX, TILE_PX), interpolation=cv2.INTER_LINEAR)
+    seen = cv2.resize(mask[cut].astype(np.uint8), (TILE_PX, TILE_PX), interpolation=cv2.INTER_NEAREST) > 0
+    draw_outline(tile, seen)
+    cv2.putText(tile, title, (8, 22), cv2.FONT_HERSHEY_SIMPLEX, 0.6, (255, 255, 255), 2)
+    return tile.astype(np.uint8)
 
 
 def draw_outline(image_rgb: UInt8[Array, "h w 3"], mask: Bool[Array, "h w"]) -> None:

@@ -79,7 +79,8 @@ def score_variant(results: Results, record: VariantRecord, truth: Truth) -> Vari
     if not tosses:
         return VariantScore({}, (), tuple(warnings))
     values = pose_values(FrameErrors.pooled([t.errors for t in tosses]), "each toss at its own first frame")
-    values["lost_frames"] = Value(sum(t.lost for t in tosses), "frames", sum(len(t.lost) for t in tracks.values()), "")
+    frames = sum(len(t.lost) for t in tracks.values())
+    values["lost_frames"] = Value(float(sum(t.lost for t in tosses)), "frames", frames, "nothing")
     if record.shared_object_frame:
         values |= _with_one_alignment(tracks, truth, points, shifts[min(shifts)])
     values |= shape_values(results, record, shifts, mesh)
