@@ -22,7 +22,7 @@ EXAMPLES = (
 
 def main(argv: Sequence[str] | None = None) -> int:
     parser = command_parser("toss-view", DESCRIPTION, *EXAMPLES)
-    parser.add_argument("path", type=Path, metavar="PATH", help="a session, an .mcap file or a results folder")
+    parser.add_argument("path", type=Path, metavar="PATH", help="a session, an .mcap file, a results folder or an .rrd")
     parser.add_argument("--save", type=Path, metavar="FILE.rrd", help="write it to a file that `rerun FILE.rrd` opens")
     parser.add_argument(
         "--screenshot",

@@ -26,6 +26,7 @@ from recordings.view_scene import Scene, moment_ns, result_bodies, results_scene
 from recordings.view_viewer import Viewer, ViewerFailed, run_rerun
 
 APPLICATION = "tosslab"
+RRD_MAGIC = b"RRF2"
 LOOK, SILENT = Look(), Silent()
 
 
@@ -47,6 +48,8 @@ def save_rrd(path: Path, out: Path, choice: Choice = Choice(), look: Look = LOOK
     """
     if out.exists():
         raise BadInput(f"{out} exists already; nothing was written. Choose another name or remove it")
+    if is_rrd(path):
+        raise BadInput(f"{path} is an .rrd already; nothing was written. Look at it with `toss-view {path}`")
     scene = None if is_foreign(path) else open_scene(path, choice)
     partial = out.with_name(out.name + ".partial")
     try:
@@ -144,11 +147,20 @@ def open_scene(path: Path, choice: Choice = Choice()) -> Scene:
 
 
 def is_foreign(path: Path) -> bool:
-    """Whether this is an MCAP file of someone else, which rerun's own loader opens."""
+    """Whether this is a file that rerun's own loader opens: an .rrd, or an MCAP file of someone else."""
+    if is_rrd(path):
+        return True
     if not path.is_file():
         return False
     with McapFile(path) as file:
         return not file.metadata("tosslab")
+
+
+def is_rrd(path: Path) -> bool:
+    if not path.is_file():
+        return False
+    with open(path, "rb") as file:
+        return file.read(len(RRD_MAGIC)) == RRD_MAGIC
 
 
 def fill(

@@ -130,16 +130,25 @@ def _plots(scene: Scene) -> rrb.Container | None:
     plots = []
     if scene.bodies:
         if scene.root == "world":
-            plots.append(rrb.TimeSeriesView(origin=f"{MOTION}/height_m", name="Height (m)"))
-        plots.append(rrb.TimeSeriesView(origin=f"{MOTION}/speed_m_s", name="Speed (m/s)"))
-        plots.append(rrb.TimeSeriesView(origin=f"{MOTION}/spin_rad_s", name="Spin (rad/s)"))
+            plots.append((f"{MOTION}/height_m", "Height (m)"))
+        plots += [(f"{MOTION}/speed_m_s", "Speed (m/s)"), (f"{MOTION}/spin_rad_s", "Spin (rad/s)")]
     if any("/arm/joint_states" in toss.file.channels for toss in recorded):
-        plots.append(rrb.TimeSeriesView(origin=f"{ARM}/angles_rad", name="Arm joints (rad)"))
-        plots.append(rrb.TimeSeriesView(origin=f"{ARM}/speeds_rad_s", name="Joint speeds (rad/s)"))
-        plots.append(rrb.TimeSeriesView(origin=f"{ARM}/finger_width_m", name="Gripper (m)"))
+        plots += [(f"{ARM}/angles_rad", "Arm joints (rad)"), (f"{ARM}/speeds_rad_s", "Joint speeds (rad/s)")]
+        plots.append((f"{ARM}/finger_width_m", "Gripper (m)"))
     if any(toss.cameras() for toss in recorded):
-        plots.append(rrb.TimeSeriesView(origin=FRAMES, name="Frame gaps (ms)"))
-    return rrb.Tabs(*plots, name="Plots") if plots else None
+        plots.append((FRAMES, "Frame gaps (ms)"))
+    axis = _plotted_range(scene)
+    views = [rrb.TimeSeriesView(origin=origin, name=name, axis_x=axis) for origin, name in plots]
+    return rrb.Tabs(*views, name="Plots") if views else None
+
+
+def _plotted_range(scene: Scene) -> rrb.TimeAxis | None:
+    """A usual toss's length before and after the moment shown: between tosses may lie minutes."""
+    if len(scene.tosses) == 1:
+        return None
+    usual_s = float(np.median([np.diff(scene.spans_ns[toss]) for toss in scene.tosses])) / 1e9
+    here = rr.TimeRangeBoundary.cursor_relative
+    return rrb.TimeAxis(view_range=rr.TimeRange(here(seconds=-usual_s), here(seconds=usual_s)))
 
 
 def _words(scene: Scene) -> rrb.Container:

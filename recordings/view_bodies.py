@@ -11,8 +11,8 @@ from numpy import ndarray as Array
 
 from recordings.geometry import CameraModel, Transform, quaternion_from_rotation, rotation_angle_rad
 from recordings.tracks import TagPlacement
-from recordings.view_layers import CAMERA, MOTION, Clock, Look, image_entity
-from recordings.view_mesh import Outline, shaded_mesh
+from recordings.view_layers import CAMERA, MOTION, Clock, Look, image_entity, plotted
+from recordings.view_mesh import outline_px, shaded_mesh
 from recordings.view_scene import Body, Color, Scene, root_poses
 
 BODY, PATH, TAGS = "world/object/{}", "world/path/{}", "world/table_tags"
@@ -164,7 +164,7 @@ def log_motion(
         entity = f"{MOTION}/{name}/{body.name}"
         style = rr.SeriesLines(names=[body.label], colors=[body.color])
         clock.at(int(times_ns[0])).log(entity, style, static=True)
-        clock.columns(entity, times_ns, rr.Scalars.columns(scalars=value))
+        clock.columns(entity, *plotted(times_ns, value))
 
 
 def speeds_m_s(times_ns: Int64[Array, " n"], matrices: Float[Array, "n 4 4"]) -> Float[Array, " n"]:
@@ -197,13 +197,12 @@ def log_outlines(
     camera_from_root = scene.calibration.find(model.frame, scene.root) if model is not None else None
     if shape is None or model is None or camera_from_root is None:
         return
-    outline = Outline.of(shape)
     for time_ns, matrix in zip(times_ns, matrices):
-        segments: Sequence[Float[Array, "2 2"]] = ()
+        borders: Sequence[Float[Array, "n 2"]] = ()
         if np.isfinite(matrix).all():
             root_from_object = Transform.from_matrix(scene.root, shape.object_frame, matrix)
-            segments = list(outline.segments(model, camera_from_root @ root_from_object))
-        strips = rr.LineStrips2D(segments, colors=[body.color], radii=-1.0)
+            borders = outline_px(shape, model, camera_from_root @ root_from_object)
+        strips = rr.LineStrips2D(borders, colors=[body.color], radii=-1.0)
         clock.at(int(time_ns)).log(f"{image_entity(scene, camera)}/outline_{body.name}", strips)
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import rerun as rr
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Float, Float32, Int64, UInt8
 from numpy import ndarray as Array
 
 from recordings.codec import decode_image
@@ -170,22 +170,28 @@ def short(values: Float[Array, "*n"]) -> Float32[Array, "*n"]:
     return (np.round(values * 2048) / 2048).astype(np.float32)
 
 
+def plotted(
+    times_ns: Int64[Array, " n"], values: Float[Array, "n ..."]
+) -> tuple[Int64[Array, " m"], rr.ComponentColumnList]:
+    """Times and columns of a plot, with NaN just after the last value: no line leads to the next toss."""
+    rows = np.vstack([values.reshape(len(values), -1), np.full((1, values[:1].size), np.nan)])
+    columns = rr.Scalars.columns(scalars=rows.ravel()).partition([rows.shape[1]] * len(rows))
+    return np.append(times_ns, times_ns[-1] + 1), columns
+
+
 def log_arm(clock: Clock, toss: Toss) -> None:
     """Joint angles, joint speeds and the gripper's width as plots."""
     states = toss.arm_states()
     if states is None or len(states.time_ns) == 0:
         return
-    joints = len(states.joint_names)
     for name, values in (("angles_rad", states.q_rad), ("speeds_rad_s", states.dq_rad_s)):
         clock.at(int(states.time_ns[0])).log(
             f"{ARM}/{name}", rr.SeriesLines(names=list(states.joint_names)), static=True
         )
-        columns = rr.Scalars.columns(scalars=values.ravel()).partition([joints] * len(values))
-        clock.columns(f"{ARM}/{name}", states.time_ns, columns)
+        clock.columns(f"{ARM}/{name}", *plotted(states.time_ns, values))
     finite = np.isfinite(states.finger_width_m)
     if finite.any():
-        columns = rr.Scalars.columns(scalars=states.finger_width_m[finite])
-        clock.columns(f"{ARM}/finger_width_m", states.time_ns[finite], columns)
+        clock.columns(f"{ARM}/finger_width_m", *plotted(states.time_ns[finite], states.finger_width_m[finite]))
 
 
 def log_frame_times(clock: Clock, toss: Toss) -> None:
@@ -194,12 +200,11 @@ def log_frame_times(clock: Clock, toss: Toss) -> None:
         frames = toss.color(camera) if len(toss.color(camera)) else toss.mono(camera)
         if len(frames) > 1:
             gaps_ms = np.diff(frames.times_ns) / 1e6
-            columns = rr.Scalars.columns(scalars=gaps_ms)
-            clock.columns(f"{FRAMES}/{camera}_gap_ms", frames.times_ns[1:], columns)
+            clock.columns(f"{FRAMES}/{camera}_gap_ms", *plotted(frames.times_ns[1:], gaps_ms))
     if len(toss.color()) and len(toss.depth()):
         rgbd = toss.rgbd()
-        columns = rr.Scalars.columns(scalars=(rgbd.depth_times_ns - rgbd.times_ns) / 1e6)
-        clock.columns(f"{FRAMES}/d455_depth_after_color_ms", rgbd.times_ns, columns)
+        late_ms = (rgbd.depth_times_ns - rgbd.times_ns) / 1e6
+        clock.columns(f"{FRAMES}/d455_depth_after_color_ms", *plotted(rgbd.times_ns, late_ms))
 
 
 def log_words(clock: Clock, toss: Toss) -> None:

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
+import cv2
 import numpy as np
 import rerun as rr
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from numpy import ndarray as Array
 
 from recordings.geometry import CameraModel, Transform
 from recordings.tracks import ObjectShape
 
 FEW_FACES = 5_000
+FINER, SUBPIXEL_BITS = 4, 4
+SUBPIXELS = 1 << SUBPIXEL_BITS
+MAX_CANVAS = 100_000.0
+"""A face may reach far out of the image; OpenCV's fixed-point corners may not."""
 
 
 def shaded_mesh(shape: ObjectShape, rgba: tuple[int, int, int, int]) -> rr.Mesh3D:
@@ -55,46 +59,22 @@ def unit(vectors: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
     return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-30)
 
 
-@dataclass(frozen=True, eq=False)
-class Outline:
-    """A mesh prepared for its outline: the edges between a face that looks at the camera and one that looks away.
+def outline_px(shape: ObjectShape, camera: CameraModel, camera_from_object: Transform) -> list[Float[Array, "n 2"]]:
+    """The border of what the shape covers in the image, through the lens: closed strips of pixels, right to 1/4 px.
 
-    `faces[e]` are the two faces at edge e; the second is -1 on an open border.
+    Faces that reach behind the camera are left out; holes have a strip of their own.
     """
-
-    vertices_m: Float[Array, "v 3"]
-    edges: Int[Array, "e 2"]
-    faces: Int[Array, "e 2"]
-    normals: Float[Array, "f 3"]
-    centres_m: Float[Array, "f 3"]
-
-    @staticmethod
-    def of(shape: ObjectShape) -> Outline:
-        """Equal vertices are joined first: texture seams are no borders."""
-        vertices_m, joined = np.unique(np.round(shape.vertices_m, 9), axis=0, return_inverse=True)
-        faces = joined.reshape(-1)[shape.faces]
-        corners = vertices_m[faces]
-        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        edges, pairs = _edges_with_faces(faces)
-        return Outline(vertices_m, edges, pairs, normals, corners.mean(axis=1))
-
-    def segments(self, camera: CameraModel, camera_from_object: Transform) -> Float[Array, "s 2 2"]:
-        """Outline segments in pixels through the lens; those behind the camera or off the image are left out."""
-        eye_m = camera_from_object.inverse().translation_m
-        towards: Bool[Array, " f"] = ((eye_m - self.centres_m) * self.normals).sum(axis=1) > 0
-        second = np.where(self.faces[:, 1] < 0, ~towards[self.faces[:, 0]], towards[self.faces[:, 1]])
-        edges = self.edges[towards[self.faces[:, 0]] != second]
-        pixels = camera.project(camera_from_object.points(self.vertices_m))[edges]
-        return pixels[camera.sees(pixels).all(axis=1)]
-
-
-def _edges_with_faces(faces: Int[Array, "f 3"]) -> tuple[Int[Array, "e 2"], Int[Array, "e 2"]]:
-    """Each edge once, with the (first two) faces that share it."""
-    sides = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-    owner = np.repeat(np.arange(len(faces)), 3)
-    order = np.lexsort((sides[:, 1], sides[:, 0]))
-    sides, owner = sides[order], owner[order]
-    first = np.flatnonzero(np.r_[True, (sides[1:] != sides[:-1]).any(axis=1)])
-    shared = np.r_[np.diff(first), len(sides) - first[-1]] > 1
-    second = np.where(shared, owner[np.minimum(first + 1, len(owner) - 1)], -1)
-    return sides[first], np.stack([owner[first], second], axis=1)
+    triangles = camera.project(camera_from_object.points(shape.vertices_m))[shape.faces]
+    triangles = triangles[np.isfinite(triangles).all(axis=(1, 2))]
+    low = np.maximum(np.floor(triangles.min(axis=(0, 1), initial=np.inf)) - 1, -1)
+    high = np.minimum(np.ceil(triangles.max(axis=(0, 1), initial=-np.inf)) + 2, [camera.width, camera.height])
+    if len(triangles) == 0 or (high <= low).any():
+        return []
+    width, height = ((high - low) * FINER).astype(int)
+    covered = np.zeros((height, width), dtype=np.uint8)
+    corners = np.clip((triangles - low) * FINER, -MAX_CANVAS, MAX_CANVAS)
+    for triangle in np.round(corners * SUBPIXELS).astype(np.int32):
+        cv2.fillConvexPoly(covered, triangle, 1, shift=SUBPIXEL_BITS)
+    borders, _ = cv2.findContours(covered, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
+    simple = [cv2.approxPolyDP(border, 1.0, True)[:, 0] for border in borders]
+    return [np.vstack([border, border[:1]]) / FINER + low for border in simple if len(border) > 2]

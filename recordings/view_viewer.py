@@ -114,7 +114,8 @@ class Viewer:
             time.sleep(POLL_S)
 
     def show(self, timeline: str, time_ns: int) -> None:
-        """Stop at a time of a timeline."""
+        """Stop at a time of a timeline, once the recording is laid out (a later blueprint would start it again)."""
+        self._loaded(time.monotonic() + LOAD_TIMEOUT_S)
         self.client.set_time(timeline, duration=np.timedelta64(time_ns, "ns"), play_state="paused")
 
     def picture(self) -> bytes:
