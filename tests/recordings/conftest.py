@@ -30,6 +30,7 @@ class SmallRig:
     unit_m: float = 0.001
     depth_scale: float = 1.0
     seed: int = 3
+    lossless_mono: bool = True
 
     @property
     def camera(self) -> CameraModel:
@@ -66,9 +67,10 @@ class SmallRig:
     def mono(self, i: int) -> EncodedImage:
         time_ns = START_NS + i * PERIOD_NS + 6_100_000
         pixels = np.random.default_rng([self.seed, i, 2]).integers(0, 9, (self.height, self.width), dtype=np.uint8)
-        return EncodedImage(
-            "mono0", 500 + i, time_ns, time_ns + 3_000_000, "mono8", self.width, self.height, pixels.tobytes()
-        )
+        encoding, data = "mono8", pixels.tobytes()
+        if not self.lossless_mono:
+            encoding, data = "jpeg", cv2.imencode(".jpg", pixels)[1].tobytes()
+        return EncodedImage("mono0", 500 + i, time_ns, time_ns + 3_000_000, encoding, self.width, self.height, data)
 
     def arm(self, i: int, samples: int = 33) -> ArmStates:
         rng = np.random.default_rng([self.seed, i, 3])
@@ -119,10 +121,10 @@ def write_session(tmp_path: Path, small_rig: SmallRig) -> WriteSession:
     return write
 
 
-@pytest.fixture(scope="session")
-def small_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """One toss of a very small rig, for tests that spoil it many times."""
-    rig = SmallRig(width=32, height=24, frames=3)
+@pytest.fixture(scope="session", params=["zstd chunks", "plain chunks"])
+def small_file(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One toss of a very small rig, for tests that spoil it many times. Raw images make zstd chunks."""
+    rig = SmallRig(width=32, height=24, frames=3, lossless_mono=request.param == "zstd chunks")
     folder = tmp_path_factory.mktemp("small") / "session"
     with SessionWriter(folder, {"object": {"name": "cube"}}, rig.calibration) as session:
         with session.toss(0) as writer:

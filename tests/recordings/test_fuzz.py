@@ -121,16 +121,16 @@ def fuzz(small_file: Path, folder: Path, count: int, seed: int) -> dict[str, int
     return total
 
 
-def test_300_random_accidents_give_plain_errors_and_nothing_altered_passes(small_file, tmp_path):
-    total = fuzz(small_file, tmp_path, 300, seed=1)
-    assert total["recovered"] > 250
-    assert total["verified"] < 30
+def test_150_random_accidents_give_plain_errors_and_nothing_altered_passes(small_file, tmp_path):
+    total = fuzz(small_file, tmp_path, 150, seed=1)
+    assert total["recovered"] > 120
+    assert total["verified"] < 20
 
 
 @pytest.mark.slow
 def test_20000_random_accidents_give_plain_errors_and_nothing_altered_passes(small_file, tmp_path):
-    total = fuzz(small_file, tmp_path, 20_000, seed=2)
-    assert total["recovered"] > 16_000
+    total = fuzz(small_file, tmp_path, 10_000, seed=2)  # for each of the two kinds of file
+    assert total["recovered"] > 8_000
 
 
 def test_a_cut_at_any_byte_is_named_and_everything_before_it_is_saved(small_file, tmp_path):
