@@ -58,8 +58,9 @@ def _asset_folders(results: Results, record: VariantRecord, name: str) -> dict[s
         stages = {toss_name(int(toss)): str(stage) for toss, stage in own.items()}
     if not stages:
         raise BadInput(
-            f"no contact model in these results ({record.name}, scope {record.scope}), and a {name} needs its inertia and "
-            "friction; wanted a variant with contact learning, for instance: toss-process SESSION --variant ours"
+            f"no contact model in these results ({record.name}, scope {record.scope}), and a {name} needs its "
+            "inertia and friction; wanted a variant with contact learning, for instance: toss-process SESSION "
+            "--variant ours"
         )
     folders = {where: results.path / stage / ASSETS / name for where, stage in stages.items()}
     for folder in folders.values():

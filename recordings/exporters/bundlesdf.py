@@ -26,7 +26,7 @@ MM = 1000.0
 def export_bundlesdf(
     source: Path, out: Path, variant: str | None = None, scope: str | None = None, progress: Progress | None = None
 ) -> ExportReport:
-    """Write OUT/toss_XX/{rgb,depth,masks}/%06d and cam_K.txt. Of results: the masks of every frame; of a session: those given.
+    """Write OUT/toss_XX/{rgb,depth,masks}/%06d and cam_K.txt; masks of every frame from results.
 
     Depth in millimetres is kept to the last bit, any other unit is rounded to millimetres and the report says so.
     """

@@ -1,7 +1,7 @@
 """`export lerobot`: a LeRobot v3 dataset, one episode per toss.
 
 ```
-data/chunk-000/file-000.parquet          one row per grid frame: states, poses, real times, depth as 16-bit PNG (no loss)
+data/chunk-000/file-000.parquet          one row per grid frame: states, poses, real times, depth as 16-bit PNG
 videos/<camera>/chunk-000/file-000.mp4   colour of all episodes one after the other (H.264, lossy)
 meta/info.json, stats.json, tasks.parquet, episodes/chunk-000/file-000.parquet
 ```
@@ -52,14 +52,14 @@ class _Dataset:
     frames: int = 0
     repeated: int = 0
 
-    def add(self, name: str, dtype: str, names: tuple[str, ...], values: Any) -> None:
+    def add(self, name: str, dtype: str, names: tuple[Any, ...], values: Any) -> None:
         self.columns.setdefault(name, Column(dtype, names)).values.extend(values)
 
 
 def export_lerobot(
     source: Path, out: Path, variant: str | None = None, scope: str | None = None, progress: Progress | None = None
 ) -> ExportReport:
-    """Write a LeRobot v3 dataset of a session; of results, with the object's pose (d455_from_object, NaN where lost)."""
+    """Write a LeRobot v3 dataset of a session; of results, with its pose (d455_from_object, NaN where lost)."""
     progress = progress or Silent()
     session = open_recording(source, variant, scope)
     tracks = Results.open(source).tracks(variant, scope) if Results.is_results(source) else {}

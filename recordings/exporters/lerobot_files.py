@@ -28,7 +28,7 @@ PIXEL_STEP = 4
 
 @dataclass
 class Column:
-    """One feature: `names` are its elements (empty for a plain number; for an image its shape), `values` a row per frame."""
+    """One feature. `names`: its elements (none for a plain number; an image's shape). `values`: a row per frame."""
 
     dtype: str
     names: tuple[Any, ...]

@@ -1,4 +1,4 @@
-"""`export tum`: one trajectory file per toss, as evo and the TUM tools read it, and the status of every line beside it."""
+"""`export tum`: one trajectory file per toss, as evo reads it, and the status of every line beside it."""
 
 from __future__ import annotations
 

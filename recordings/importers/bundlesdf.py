@@ -1,6 +1,6 @@
 """`toss-session import bundlesdf`: folders of BundleSDF, FoundationPose and YCBInEOAT (rgb, depth, masks, cam_K.txt).
 
-The layout has no times: they are made from `--fps`, frame number by frame number, and the session says that they are assumed.
+The layout has no times: they are made from `--fps` and the frame numbers, and the session says that they are assumed.
 """
 
 from __future__ import annotations
@@ -51,10 +51,10 @@ class _Toss:
 def import_bundlesdf(
     sources: Sequence[Path], out: Path, fps: float = 30.0, progress: Progress | None = None
 ) -> ImportReport:
-    """Make a session at `out`, one toss per folder (a folder of toss_XX folders, as `export` writes it, stands for all).
+    """Make a session at `out`, one toss per folder (a folder of toss_XX folders stands for all of them).
 
-    Depth is taken as uint16 millimetres, aligned to colour. `annotated_poses/*.txt` (4x4 camera_from_object) become truth/.
-    Raises BadInput or WriteFailed; then nothing is left at `out`.
+    Depth is taken as uint16 millimetres, aligned to colour. `annotated_poses/*.txt` (4x4 camera_from_object) become
+    truth/. Raises BadInput or WriteFailed; then nothing is left at `out`.
     """
     progress, warnings = progress or Silent(), Warnings()
     if not 0.1 <= fps <= 100_000:
@@ -70,7 +70,8 @@ def import_bundlesdf(
         out,
         "bundlesdf",
         sources[0],
-        f"the layout has no times: made from {fps:g} frames per second; every toss starts at clock_offset_ns of its file",
+        f"the layout has no times: made from {fps:g} frames per second; every toss starts at clock_offset_ns "
+        "of its file",
         object={"name": "object"},
         rig={"cameras": ["d455"], "d455": {"depth_unit_m": DEPTH_UNIT_M, "fps_assumed": fps}},
     )
@@ -106,7 +107,8 @@ def _list_toss(number: int, folder: Path, warnings: Warnings) -> _Toss:
     alone = sorted({int(p.stem) for p in color} ^ {int(p.stem) for p in depth})
     if alone:
         raise BadInput(
-            f"{folder}: {len(color)} colour and {len(depth)} depth images; frame {alone[0]} is only in one of rgb/ and depth/"
+            f"{folder}: {len(color)} colour and {len(depth)} depth images; frame {alone[0]} is only in one of "
+            "rgb/ and depth/"
         )
     header = read_header(common.read_bytes(color[0]), str(color[0]))
     K = _camera_matrix(folder / "cam_K.txt")
@@ -174,13 +176,15 @@ def _depths(t: TossWriter, toss: _Toss, times_ns: Int64[Array, " n"], warnings: 
         raw = read_depth_png(path)
         if raw.shape != wanted:
             raise BadInput(
-                f"{path} is {raw.shape[1]}x{raw.shape[0]}, the colour images {wanted[1]}x{wanted[0]}: depth is not aligned to "
-                "colour, which this layout asks for. With both intrinsics and the transform use `toss-session import folder`"
+                f"{path} is {raw.shape[1]}x{raw.shape[0]}, the colour images {wanted[1]}x{wanted[0]}: depth is "
+                "not aligned to colour, which this layout asks for. With both intrinsics and the transform "
+                "use `toss-session import folder`"
             )
         seen = raw[raw > 0]
         if len(seen) and float(np.median(seen)) * DEPTH_UNIT_M > FAR_M:
             warnings.add(
-                f"{toss.folder.name}/depth/{path.name}: half of the depth is beyond {FAR_M:g} m when read as millimetres; "
+                f"{toss.folder.name}/depth/{path.name}: half of the depth is beyond {FAR_M:g} m when read as "
+                "millimetres; "
                 "is its unit another one (0.25 mm, 0.1 mm)? Convert it to millimetres first"
             )
         yield time_ns, partial(t.depth, DepthImage("d455", frame, time_ns, time_ns, DEPTH_UNIT_M, raw))

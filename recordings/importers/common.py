@@ -1,4 +1,4 @@
-"""What every importer needs: a session that is whole or not there, files read with plain errors, streams in time order."""
+"""What every importer needs: a session that is whole or not there, files read with plain errors, in time order."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from recordings.tracks import RigCalibration
 WRAP_32BIT_US_NS = (1 << 32) * 1000
 """A 32-bit microsecond counter starts anew after this (71.6 minutes)."""
 TOSS_SPACING_NS = 60_000_000_000
-"""Imported tosses whose clocks all start at 0 are laid this far apart on the session clock, or further if one is longer."""
+"""Imported tosses whose clocks all start at 0 are laid this far apart on the session clock, or further."""
 
 Write = Callable[[], None]
 Timed = tuple[int, Write]
@@ -66,8 +66,8 @@ class Warnings:
 
 @contextmanager
 def new_session(out: Path, start: Mapping[str, Any], calibration: RigCalibration) -> Iterator[SessionWriter]:
-    """A session that is finished on a clean exit. After an error nothing is left at `out`; after an interruption what is
-    there is kept, with a stop document that says so."""
+    """A session that is finished on a clean exit. After an error nothing is left at `out`; after an interruption what
+    is there is kept, with a stop document that says so."""
     was_there = out.exists()
     writer = SessionWriter(out, start, calibration)  # refuses an `out` that is not empty: what we remove below is ours
     try:

@@ -1,7 +1,7 @@
 """`toss-session import contactnets`: toss files of ContactNets and dair_pll (poses only), for contact learning alone.
 
-What the columns mean is checked against the numbers themselves: positions against velocities (step), quaternions against
-spins (order), free fall against gravity (scale). What was found is kept in the start document, `import.checks`.
+What the columns mean is checked against the numbers themselves: positions against velocities (step), quaternions
+against spins (order), free fall against gravity (scale). What was found is kept in the start document, `import.checks`.
 """
 
 from __future__ import annotations
@@ -73,7 +73,8 @@ def import_contactnets(
     if twins:
         named = ", ".join("=".join(map(str, group)) for group in twins[:6]) + (", ..." if len(twins) > 6 else "")
         warnings.add(
-            f"{len(twins)} groups of tosses are the same recording ({named}): kept; never split a group between learning and test"
+            f"{len(twins)} groups of tosses are the same recording ({named}): kept; never split a group between "
+            "learning and test"
         )
     spans = {number: (0, _time_ns(len(t.position_m) - 1, units.dt_s)) for number, t in tosses.items()}
     offsets = common.clock_offsets_ns(spans)
@@ -108,7 +109,7 @@ def _toss_files(source: Path, warnings: Warnings) -> dict[int, Path]:
 
 
 def _parameters(source: Path) -> Mapping[str, Any]:
-    """params_processed/experiment.json inside the folder, beside it, or (for one file) beside its folder. {} if none."""
+    """params_processed/experiment.json inside the folder, beside it, or (for one file) beside its folder; else {}."""
     for folder in (source, source.parent, source.parent.parent):
         path = folder / "params_processed" / "experiment.json"
         if path.exists():
@@ -187,7 +188,8 @@ def _states(number: int, table: Float[Array, "t c"], path: Path, units: _Units) 
     length = np.linalg.norm(quaternions, axis=1)
     if np.abs(length - 1).max() > 1e-2:
         raise BadInput(
-            f"{path}: columns {columns.quaternion_wxyz}.. are no unit quaternions (length {length.min():.3g}..{length.max():.3g})"
+            f"{path}: columns {columns.quaternion_wxyz}.. are no unit quaternions (length "
+            f"{length.min():.3g}..{length.max():.3g})"
         )
     return States(
         position_m=part(columns.position, 3) * units.scale_m,
@@ -218,7 +220,7 @@ def _start(
 
 
 def _physics(params: Mapping[str, Any]) -> dict[str, Any]:
-    """Mass and inertia (theirs is in kg times their unit of length squared). Friction is what is to be learned: left out."""
+    """Mass and inertia (theirs is in kg times their unit of length squared). Friction is to be learned: left out."""
     mass, inertia, scale_m = _number(params, "mass"), params.get("inertia"), _params_scale_m(params)
     if mass is None or inertia is None or scale_m is None:
         return {}

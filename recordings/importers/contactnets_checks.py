@@ -24,7 +24,7 @@ MOVING_M_S, TURNING_RAD_S = 0.2, 1.0
 
 @dataclass(frozen=True, eq=False)
 class States:
-    """One toss in SI: positions and velocities in the world, quaternions world_from_object, spin in the object frame."""
+    """One toss in SI: positions and velocities in the world, quaternions world_from_object, spin in the object."""
 
     position_m: Float[Array, "t 3"]
     quaternion_wxyz: Float[Array, "t 4"]
@@ -36,9 +36,9 @@ class States:
 class Checks:
     """Medians over all tosses. None where the motion does not tell.
 
-    `step_ratio`: the step that velocities and positions say, over the one used. `fall_m_s2`: acceleration along z in the
-    first steps. `spin_mismatch_rad_s`: stored spins against quaternion differences, read as wxyz in the object frame (as
-    the format says), the same in the world frame, and read as xyzw.
+    `step_ratio`: the step that velocities and positions say, over the one used. `fall_m_s2`: acceleration along z in
+    the first steps. `spin_mismatch_rad_s`: stored spins against quaternion differences, read as wxyz in the object
+    frame (as the format says), the same in the world frame, and read as xyzw.
     """
 
     step_ratio: float | None
@@ -110,7 +110,7 @@ def _first_accelerations(toss: States, dt_s: float) -> Float[Array, "n 3"]:
 def _spin_gaps(
     toss: States, dt_s: float, quaternions: Float[Array, "t 4"], *, world: bool = False
 ) -> Float[Array, " n"]:
-    """|stored spin - spin of the quaternion differences|, rad/s, in the object frame (or the world), for turning steps."""
+    """|stored spin - spin of the quaternion differences|, rad/s, in the object (or the world), for turning steps."""
     conjugate = quaternions * [1, -1, -1, -1]
     turn = _product(quaternions[1:], conjugate[:-1]) if world else _product(conjugate[:-1], quaternions[1:])
     turn *= np.where(turn[:, :1] < 0, -1.0, 1.0)
@@ -131,7 +131,8 @@ def _product(a: Float[Array, "n 4"], b: Float[Array, "n 4"]) -> Float[Array, "n 
 def _judge_step(ratio: float | None, dt_s: float, warnings: Warnings) -> None:
     if ratio is None or abs(ratio - 1) <= STEP_WARNED:
         return
-    said = f"positions and velocities say a step of {ratio * dt_s:.6g} s, {100 * (ratio - 1):+.2g} % off the given {dt_s:.6g} s"
+    off = f"{100 * (ratio - 1):+.2g} % off the given {dt_s:.6g} s"
+    said = f"positions and velocities say a step of {ratio * dt_s:.6g} s, {off}"
     if abs(ratio - 1) > STEP_REFUSED:
         raise BadInput(f"{said}; give the right one: --dt {ratio * dt_s:.6g}")
     warnings.add(said)
@@ -146,7 +147,8 @@ def _judge_spin(checks: Checks, warnings: Warnings) -> None:
             "the quaternions fit the spins when read as x y z w; wanted files with w x y z, as the format says"
         )
     warnings.add(
-        f"spins and quaternions disagree (median {here:.2g} rad/s): is the spin in another frame? Poses are kept as they are"
+        f"spins and quaternions disagree (median {here:.2g} rad/s): is the spin in another frame? Poses are "
+        "kept as they are"
     )
 
 
@@ -156,6 +158,7 @@ def _judge_fall(fall: float | None, sideways: float | None, warnings: Warnings) 
         return
     if abs(fall / -GRAVITY_M_S2 - 1) > FALL_REFUSED:
         raise BadInput(
-            f"with this scale things fall at {-fall:.3g} m/s^2; wanted about {GRAVITY_M_S2}: is --scale (metres per unit of "
+            f"with this scale things fall at {-fall:.3g} m/s^2; wanted about {GRAVITY_M_S2}: is --scale (metres "
+            "per unit of "
             f"position) {GRAVITY_M_S2 / -fall:.3g} times as large?"
         )

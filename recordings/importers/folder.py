@@ -1,4 +1,4 @@
-"""`toss-session import folder`: DESIGN's folder layout into a session (the layout of `data/cube_dev` and `data/lab_dev`).
+"""`toss-session import folder`: DESIGN's folder layout into a session (that of `cube_dev` and `lab_dev`).
 
 Each toss of the layout has its own clock starting at 0. On the session clock toss k starts at `clock_offset_ns` of its
 file's info, so that the clock grows over the session; `export folder` takes the offset off again.
@@ -153,7 +153,8 @@ def _same_frames(folder: Path, color: Sequence[Path], depth: Sequence[Path]) -> 
     missing = sorted({int(p.stem) for p in color} ^ {int(p.stem) for p in depth})
     if missing:
         raise BadInput(
-            f"{folder}: {len(color)} colour and {len(depth)} depth images; frame {missing[0]} is only in one of rgb/ and depth/. "
+            f"{folder}: {len(color)} colour and {len(depth)} depth images; frame {missing[0]} is only in one of "
+            "rgb/ and depth/. "
             "Wanted the same numbers in both, or depth_timestamps.txt with one time per depth image"
         )
 
@@ -176,7 +177,7 @@ def _list_mono(layout: Layout, toss: str) -> dict[str, _Images]:
 
 
 def _read_arm(path: Path, arm: str) -> ArmStates | None:
-    """arm.csv: time_s, q1.., dq1.., finger_width_m (optional). Times to the nanosecond, numbers as Python reads them."""
+    """arm.csv: time_s, q1.., dq1.., finger_width_m (optional). Times to the nanosecond, numbers to the last bit."""
     if not path.exists():
         return None
     lines = [line.split(",") for line in common.read_text(path).splitlines() if line.strip()]
@@ -249,8 +250,9 @@ def _depths_in_time(
         raw = read_depth_png(path)
         if raw.shape != wanted:
             raise BadInput(
-                f"{path} is {raw.shape[1]}x{raw.shape[0]}, its camera {wanted[1]}x{wanted[0]}; where depth is not aligned to "
-                "colour, session.json says so (depth_aligned_to_color false) and gives depth_camera and T_camera_depth"
+                f"{path} is {raw.shape[1]}x{raw.shape[0]}, its camera {wanted[1]}x{wanted[0]}; where depth is "
+                "not aligned to colour, session.json says so (depth_aligned_to_color false) and gives "
+                "depth_camera and T_camera_depth"
             )
         image = DepthImage("d455", int(path.stem), time_ns, time_ns, layout.depth_unit_m, raw)
         yield time_ns, partial(t.depth, image)

@@ -1,4 +1,4 @@
-"""session.json and mono/cameras.json of the folder layout: cameras, transforms, tags, and what the layout says besides."""
+"""session.json and mono/cameras.json of the folder layout: cameras, transforms, tags and the rest."""
 
 from __future__ import annotations
 
@@ -19,7 +19,8 @@ from recordings.tracks import RigCalibration, TagPlacement
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """session.json of the folder layout, understood. `document` is the file as it is, `mono_document` mono/cameras.json."""
+    """session.json of the folder layout, understood. `document` is the file as it is, `mono_document`
+    mono/cameras.json."""
 
     source: Path
     document: Mapping[str, Any]
@@ -125,11 +126,13 @@ def _transforms(document: Mapping[str, Any], path: Path) -> list[Transform]:
 
 
 def _depth_camera(document: Mapping[str, Any], path: Path) -> tuple[CameraModel, Transform]:
-    """Not in the shared data: `depth_camera` {K, distortion, width, height} and `T_camera_depth` (d455_from_d455_depth)."""
+    """Not in the shared data: `depth_camera` {K, distortion, width, height} and `T_camera_depth`
+    (d455_from_d455_depth)."""
     given = document.get("depth_camera")
     if not isinstance(given, dict) or document.get("T_camera_depth") is None:
         raise BadInput(
-            f"{path}: depth_aligned_to_color is false, so aligning needs `depth_camera` {{K, distortion, width, height}} "
+            f"{path}: depth_aligned_to_color is false, so aligning needs `depth_camera` "
+            f"{{K, distortion, width, height}} "
             "and `T_camera_depth` (4x4, colour from depth); add both, or give depth aligned to colour"
         )
     camera = camera_model(given, "d455_depth", str(path))

@@ -14,8 +14,8 @@ GRID = 24
 def fit_brown_conrady(
     rays: Callable[[Float[Array, "n 2"]], Float[Array, "n 2"]], K: Float[Array, "3 3"], width: int, height: int
 ) -> tuple[tuple[float, ...], float]:
-    """Coefficients (k1 k2 p1 p2 k3) under which the pixels of a grid are seen along the given rays, and the largest error
-    in pixels. `rays` gives (x, y) of the ray (x, y, 1) of each pixel.
+    """Coefficients (k1 k2 p1 p2 k3) under which the pixels of a grid are seen along the given rays, and the largest
+    error in pixels. `rays` gives (x, y) of the ray (x, y, 1) of each pixel.
 
     The model is linear in its coefficients: with r^2 = x^2 + y^2 the distorted minus the ideal point is
     (x (k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2), y (...) + p1 (r^2 + 2 y^2) + 2 p2 x y).

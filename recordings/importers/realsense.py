@@ -1,7 +1,7 @@
-"""`toss-session import realsense`: recordings of RealSense cameras, .bag (librealsense up to 2.56) and .db3 (from 2.58 on).
+"""`toss-session import realsense`: recordings of RealSense cameras, .bag (up to 2.56) and .db3 (from 2.58 on).
 
-Every frame of every sensor is read as it was recorded: nothing is paired, dropped or aligned on the way. Colour and depth
-keep their own stamps; depth stays in the depth camera's frame, with its intrinsics and its place beside colour.
+Every frame of every sensor is read as it was recorded: nothing is paired, dropped or aligned on the way. Colour and
+depth keep their own stamps; depth stays in the depth camera's frame, with its intrinsics and its place beside colour.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ STAMPS = ("frame_timestamp", "sensor_timestamp", "time_of_arrival")
 
 @dataclass(frozen=True, eq=False)
 class _Frame:
-    """One frame as the playback gives it. `stamp_ms` is on the device's clock, `metadata` those of STAMPS that it has."""
+    """One frame as the playback gives it. `stamp_ms` is on the device's clock, `metadata` its STAMPS."""
 
     kind: str
     number: int
@@ -97,8 +97,8 @@ class _Seen:
 
 
 def import_realsense(sources: Sequence[Path], out: Path, progress: Progress | None = None) -> ImportReport:
-    """Make a session at `out`, one toss per recording. Raises BadInput, WriteFailed or DeviceNotFound (no pyrealsense2);
-    then nothing is left at `out`."""
+    """Make a session at `out`, one toss per recording. Raises BadInput, WriteFailed or DeviceNotFound (no
+    pyrealsense2); then nothing is left at `out`."""
     progress, warnings = progress or Silent(), Warnings()
     for source in sources:
         _check_file(source)
@@ -145,7 +145,8 @@ def _sdk() -> Any:
         import pyrealsense2
     except ImportError as missing:
         raise DeviceNotFound(
-            "reading RealSense recordings needs pyrealsense2, which is not installed; run `pip install -e .[rig-realsense]`"
+            "reading RealSense recordings needs pyrealsense2, which is not installed; run `pip install -e "
+            ".[rig-realsense]`"
         ) from missing
     return pyrealsense2
 

@@ -46,7 +46,7 @@ def is_compressed(message: Any) -> bool:
 
 
 def color_image(message: Any, path: Path, topic: str, *, grey: bool) -> Pixels:
-    """A colour image (or, with `grey`, a one-channel one). JPEG and PNG bytes are kept; raw pixels become rgb8 or mono8."""
+    """A colour image (or, with `grey`, a one-channel one). JPEG and PNG bytes are kept; others become rgb8 or mono8."""
     if is_compressed(message):
         data = bytes(message.data)
         header = read_header(data, f"{path.name}: an image of {topic}")

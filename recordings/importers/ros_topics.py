@@ -36,7 +36,7 @@ class Topics:
 
 
 def choose(bag: Bag, color: str | None, depth: str | None) -> Topics:
-    """Find colour, depth, grey and joint topics. Raises BadInput where there are no images, or several that could be colour."""
+    """Find colour, depth, grey and joint topics. Raises BadInput where there are no images, or several colours."""
     kinds = {topic: _kind(bag, topic) for topic in (*bag.topics(IMAGE), *bag.topics(COMPRESSED))}
     for asked in (color, depth):
         if asked is not None and asked not in kinds:
@@ -100,8 +100,8 @@ def _one(bag: Bag, topics: Sequence[str], option: str) -> str | None:
 
 
 def describe(bag: Bag, topics: Topics, warnings: Warnings) -> RigCalibration:
-    """Camera models from camera_info, the place of the depth camera from tf_static. Raises BadInput where depth cannot be
-    laid on colour."""
+    """Camera models from camera_info, the place of the depth camera from tf_static. Raises BadInput where depth
+    cannot be laid on colour."""
     cameras: dict[str, CameraModel] = {}
     transforms: list[Transform] = []
     infos = {name: _info(bag, topic) for name, topic in {"d455": topics.color, **topics.mono}.items() if topic}
@@ -164,7 +164,8 @@ def _place_depth(
     if place is None:
         raise BadInput(
             f"{bag.path}: {topic} is not aligned to colour, and /tf_static does not connect its frame "
-            f"'{info.header.frame_id}' to '{color_info.header.frame_id}'; record the aligned depth topic, or tf_static too"
+            f"'{info.header.frame_id}' to '{color_info.header.frame_id}'; record the aligned depth topic, or "
+            "tf_static too"
         )
     cameras["d455_depth"] = depth
     transforms.append(Transform.from_matrix("d455", "d455_depth", place.matrix))

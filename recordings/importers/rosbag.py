@@ -1,7 +1,8 @@
-"""`toss-session import rosbag`: ROS 1 and ROS 2 bags (.bag, a folder with metadata.yaml, .mcap, .db3) of the usual image topics.
+"""`toss-session import rosbag`: ROS 1 and ROS 2 bags (.bag, folder, .mcap, .db3) of the usual image topics.
 
-One bag is one toss. Colour is `d455`, its depth beside it; other grey images become `mono0`, `mono1`, ... in the order of
-their topics. Times are the headers' stamps (mid-exposure, as far as the driver says), log times when the bag received them.
+One bag is one toss. Colour is `d455`, its depth beside it; other grey images become `mono0`, `mono1`, ... in the
+order of their topics. Times are the headers' stamps (mid-exposure, as far as the driver says), log times when the bag
+received them.
 """
 
 from __future__ import annotations

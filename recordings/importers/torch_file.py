@@ -1,9 +1,9 @@
 """One tensor out of a .pt file, without torch and without executing anything.
 
-torch.save writes a pickle that names where the numbers lie. Here its opcodes are walked (`pickletools.genops` only reads)
-and nothing is accepted but what a plain tensor needs: numbers, text, tuples, lists, dicts, the storage types, and the calls
-`torch._utils._rebuild_tensor_v2` and `collections.OrderedDict`, which are recognised by name and never imported.
-Both containers are read: the zip archive of torch 1.6 and later, and the older chain of pickles.
+torch.save writes a pickle that names where the numbers lie. Here its opcodes are walked (`pickletools.genops` only
+reads) and nothing is accepted but what a plain tensor needs: numbers, text, tuples, lists, dicts, the storage types,
+and the calls `torch._utils._rebuild_tensor_v2` and `collections.OrderedDict`, which are recognised by name and never
+imported. Both containers are read: the zip archive of torch 1.6 and later, and the older chain of pickles.
 """
 
 from __future__ import annotations
