@@ -75,7 +75,7 @@ class McapFile:
             raise BadInput(f"{path} is a folder; wanted an .mcap file") from folder
         except OSError as refused:
             raise BadInput(f"{path} cannot be opened: {refused.strerror}") from refused
-        self._check_ends()
+        self._guard(self._check_ends, "its beginning or end")
         self.summary: Summary = self._guard(self._read_summary, "its index")
         self._cache: OrderedDict[int, bytes | memoryview] = OrderedDict()
 
@@ -165,8 +165,8 @@ class McapFile:
             raise BadInput(f"{self.path} is not an MCAP file: it begins with {start[:8]!r}")
         if end != MAGIC or self.size < 8 + 29 + 8:
             raise DamagedFile(
-                f"{self.path} was cut off: it has no MCAP end mark. Its complete chunks can be saved: "
-                f"`toss-session recover {self.path} NEW.mcap`"
+                f"{self.path} was cut off, or is still being written: it has no MCAP end mark. Its complete "
+                f"chunks can be saved: `toss-session recover {self.path} NEW.mcap`"
             )
 
     @cached_property
