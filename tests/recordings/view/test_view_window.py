@@ -1,0 +1,75 @@
+"""The viewer without a window: screenshots, and where it listens."""
+
+import socket
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from recordings.view import open_scene, screenshot, stream
+from recordings.view_layers import TIME
+from recordings.view_viewer import LOOPBACK, Viewer, ViewerFailed
+
+
+@pytest.fixture(scope="session")
+def viewer():
+    """A viewer without a window; skipped where there is no graphics driver."""
+    try:
+        running = Viewer(headless=True, size=(800, 500)).__enter__()
+    except ViewerFailed as missing:
+        pytest.skip(str(missing))
+    yield running
+    running.close()
+
+
+def test_without_a_graphics_driver_the_message_names_the_packages(monkeypatch):
+    monkeypatch.setenv("VK_DRIVER_FILES", "nothing.json")
+    monkeypatch.setenv("VK_ICD_FILENAMES", "nothing.json")
+    monkeypatch.setenv("WGPU_BACKEND", "vulkan")
+    with pytest.raises(ViewerFailed, match=r"apt-get install -y libvulkan1 mesa-vulkan-drivers"), Viewer(headless=True):
+        pass
+
+
+def test_the_viewer_shows_the_streamed_scene_without_complaint(session, viewer):
+    scene = open_scene(session)
+    stream(scene, viewer)
+    viewer.wait_for(TIME, scene.spans_ns[1][1])
+    state = viewer.client.get_state()
+    assert {"The table in 3D", "Colour of d455", "Depth"} <= {view.name for view in state.views}
+    assert not [report for view in state.views for report in view.reports]
+    names = {e.entity_path for e in viewer.client.get_recording_schema(paths_only=True).entities}
+    assert "/world/object/truth/shape" in names
+    assert not [log.message for log in viewer.client.get_logs() if "invalid" in log.message.lower()]
+
+
+def test_the_viewer_listens_on_the_loopback_address_only(viewer):
+    port = int(viewer.url.split(":")[-1].split("/")[0])
+    listening = {
+        bytes.fromhex(line.split()[1].split(":")[0])[::-1]
+        for name in ("/proc/net/tcp", "/proc/net/tcp6")
+        for line in Path(name).read_text().splitlines()[1:]
+        if line.split()[3] == "0A" and int(line.split()[1].split(":")[1], 16) == port
+    }
+    assert listening == {socket.inet_aton(LOOPBACK)}
+
+
+@pytest.mark.usefixtures("viewer")
+def test_a_screenshot_shows_the_scene(session, tmp_path):
+    screenshot(session, tmp_path / "s.png", size=(800, 500))
+    picture = cv2.imread(str(tmp_path / "s.png"))
+    assert picture.shape == (500, 800, 3)
+    blue = (np.abs(picture.astype(int) - (200, 90, 40)) < 40).all(axis=2)
+    space, image = blue[:, :450], blue[30:200, 480:]
+    assert space.sum() > 500  # the cloud
+    assert image.sum() > 1000  # the colour image
+    assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 200
+
+
+def test_a_viewer_that_was_closed_leaves_no_process():
+    try:
+        with Viewer(headless=True) as running:
+            process = running._process
+    except ViewerFailed as missing:
+        pytest.skip(str(missing))
+    assert process.poll() is not None
