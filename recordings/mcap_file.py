@@ -9,6 +9,7 @@ from __future__ import annotations
 import io
 import os
 import struct
+import threading
 import zlib
 from collections import OrderedDict
 from collections.abc import Callable, Iterator
@@ -64,7 +65,10 @@ class Message:
 
 
 class McapFile:
-    """An MCAP file with an index. Raises BadInput when it is none, DamagedFile when it was cut off or altered."""
+    """An MCAP file with an index. Raises BadInput when it is none, DamagedFile when it was cut off or altered.
+
+    Several threads may read at once (a replayed rig has one per device).
+    """
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -77,6 +81,7 @@ class McapFile:
             raise BadInput(f"{path} cannot be opened: {refused.strerror}") from refused
         self._guard(self._check_ends, "its beginning or end")
         self.summary: Summary = self._guard(self._read_summary, "its index")
+        self._lock = threading.Lock()
         self._cache: OrderedDict[int, bytes | memoryview] = OrderedDict()
 
     def __enter__(self) -> McapFile:
@@ -246,13 +251,15 @@ class McapFile:
         return chunk, chunk.chunk_start_offset + _CHUNK_HEAD.size + 4 + len(chunk.compression.encode()) + 8
 
     def _chunk(self, number: int) -> bytes | memoryview:
-        if number in self._cache:
-            self._cache.move_to_end(number)
-            return self._cache[number]
+        with self._lock:
+            if number in self._cache:
+                self._cache.move_to_end(number)
+                return self._cache[number]
         data = self._guard(lambda: self._load_chunk(number), f"chunk {number}")
-        self._cache[number] = data
-        while len(self._cache) > CACHED_CHUNKS:
-            self._cache.popitem(last=False)
+        with self._lock:
+            self._cache[number] = data
+            while len(self._cache) > CACHED_CHUNKS:
+                self._cache.popitem(last=False)
         return data
 
     def _load_chunk(self, number: int) -> bytes | memoryview:

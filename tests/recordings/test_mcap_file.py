@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -80,6 +81,16 @@ def test_reading_in_order_reads_each_chunk_once(large, bytes_read):
     with McapFile(large) as file:
         assert [m.sequence for m in file.messages("/camera")] == list(range(COUNT))
     assert sum(bytes_read) < 1.1 * large.stat().st_size
+
+
+def test_several_threads_read_at_once(large):
+    with McapFile(large) as file, ThreadPoolExecutor(4) as pool:
+
+        def numbers(seed: int) -> bool:
+            wanted = np.random.default_rng(seed).permutation(COUNT)[:100]
+            return all(file.read("/camera", int(i)).sequence == i for i in wanted)
+
+        assert all(pool.map(numbers, range(8)))
 
 
 def test_messages_out_of_order_come_in_the_order_of_their_log_time(tmp_path):
