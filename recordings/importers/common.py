@@ -190,12 +190,13 @@ def clock_offsets_ns(first_and_last_ns: Mapping[int, tuple[int, int]]) -> dict[i
     return {toss: toss * spacing + lead for toss in first_and_last_ns}
 
 
-def new_start(out: Path, layout: str, source: Path, clock: str, **more: Any) -> dict[str, Any]:
-    """The start document of an imported session. `clock` says where its times come from and what is assumed of them."""
+def new_start(out: Path, layout: str, source: Path, clock: str, *, assumed: bool = True, **more: Any) -> dict[str, Any]:
+    """The start document of an imported session. `clock` says where its times come from; `assumed`: they are made up
+    in part, so that nobody takes them for measured."""
     return {
         "name": out.resolve().name,
         "who": f"toss-session import {layout}",
-        "clock": {"source": f"import {layout}", "assumed": clock},
+        "clock": {"source": f"import {layout}", "assumed" if assumed else "stamps": clock},
         "import": {"layout": layout, "source": source.resolve().name},
         **more,
     }

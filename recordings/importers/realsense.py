@@ -112,7 +112,8 @@ def import_realsense(sources: Sequence[Path], out: Path, progress: Progress | No
         out,
         "realsense",
         sources[0],
-        "nothing: the device's own stamps, moved to mid-exposure where it says sensor_timestamp",
+        "the device's own, moved to mid-exposure where it says sensor_timestamp",
+        assumed=False,
         object={"name": "object"},
     )
     start["rig"] = {"cameras": ["d455"], "d455": about}

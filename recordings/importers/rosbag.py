@@ -52,7 +52,7 @@ def import_rosbag(
             tosses.append((source, choose(bag, color, depth)))
     with closing(Bag(sources[0])) as bag:
         calibration = describe(bag, tosses[0][1], warnings)
-    start = common.new_start(out, "rosbag", sources[0], "nothing: the headers' stamps", object={"name": "object"})
+    start = common.new_start(out, "rosbag", sources[0], "the headers' own", assumed=False, object={"name": "object"})
     start["rig"] = {"cameras": sorted(calibration.cameras), "topics": [vars(topics) for _, topics in tosses]}
     with common.new_session(out, start, calibration) as writer:
         for number, (source, topics) in enumerate(tosses):

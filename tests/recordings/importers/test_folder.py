@@ -224,6 +224,10 @@ SPOILT = {
     ),
     "a grey image": (lambda s: _png(s.toss / "rgb" / "000003.jpg", np.zeros((48, 64), np.uint8)), "8-bit colour"),
     "an empty image": (lambda s: (s.toss / "rgb" / "000003.jpg").write_bytes(b""), "empty"),
+    "a folder where an image should be": (
+        lambda s: [(s.toss / "rgb" / "000003.jpg").unlink(), (s.toss / "rgb" / "000003.jpg").mkdir()],
+        "000003.jpg cannot be read",
+    ),
     "no image": (lambda s: (s.toss / "rgb" / "000003.jpg").write_bytes(b"hello, I am text"), "neither JPEG nor PNG"),
     "an image cut off": (
         lambda s: (s.toss / "rgb" / "000003.jpg").write_bytes((s.toss / "rgb" / "000003.jpg").read_bytes()[:-40]),
