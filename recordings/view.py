@@ -21,7 +21,7 @@ from recordings.view_arm import known_arm, log_arm_model, log_arm_motion
 from recordings.view_blueprint import ABOUT, about_text, blueprint
 from recordings.view_bodies import log_bodies, log_rig
 from recordings.view_file import PipedFile
-from recordings.view_layers import EVENTS, TIME, Clock, Look, log_toss
+from recordings.view_layers import EVENTS, TIME, Clock, Look, Steps, log_toss
 from recordings.view_scene import Scene, moment_ns, result_bodies, results_scene, session_scene
 from recordings.view_viewer import Viewer, ViewerFailed, run_rerun
 
@@ -176,7 +176,9 @@ def fill(
     robot = known_arm(scene)
     if robot is not None:
         log_arm_model(recording, robot)
-    for toss in scene.tosses if tosses is None else tosses:
+    chosen = scene.tosses if tosses is None else tosses
+    steps = Steps(progress, scene, chosen)
+    for toss in chosen:
         clock = Clock(recording, toss, scene.shift_ns[toss])
         start_ns, end_ns = scene.spans_ns[toss]
         clear(clock.at(start_ns))
@@ -184,10 +186,11 @@ def fill(
         log_bodies(recording, scene, toss)
         if robot is not None:
             log_arm_motion(recording, scene, robot, toss)
-        log_toss(recording, scene, toss, look, progress)
+        log_toss(recording, scene, toss, look, steps)
         flush(recording)  # the end is the last to arrive: who sees it has all of the toss
         clock.at(end_ns).log(EVENTS, rr.TextLog(f"toss {toss}: recording ends"))
         flush(recording)
+        steps.next(f"toss {toss}")
 
 
 def flush(recording: rr.RecordingStream) -> None:

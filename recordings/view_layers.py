@@ -63,7 +63,21 @@ class Clock:
         self._recording.send_columns(entity, indexes, columns)
 
 
-def log_toss(recording: rr.RecordingStream, scene: Scene, toss: int, look: Look, progress: Progress) -> None:
+class Steps:
+    """One progress over all tosses: a step for each cloud and one for each toss."""
+
+    def __init__(self, progress: Progress, scene: Scene, tosses: tuple[int, ...]) -> None:
+        recorded = [scene.toss(toss) for toss in tosses]
+        self._total = len(tosses) + sum(len(toss.color()) for toss in recorded if toss is not None)
+        self._progress = progress
+        self._done = 0
+
+    def next(self, note: str) -> None:
+        self._done = min(self._done + 1, self._total)
+        self._progress.step(self._done, self._total, note)
+
+
+def log_toss(recording: rr.RecordingStream, scene: Scene, toss: int, look: Look, steps: Steps) -> None:
     """Everything that was recorded in one toss."""
     recorded = scene.toss(toss)
     if recorded is None:
@@ -73,7 +87,7 @@ def log_toss(recording: rr.RecordingStream, scene: Scene, toss: int, look: Look,
         log_images(clock, scene, recorded, camera)
     if len(recorded.color()) and len(recorded.depth()):
         log_depth(clock, recorded)
-        log_cloud(clock, scene, recorded, look, progress)
+        log_cloud(clock, scene, recorded, look, steps)
     log_arm(clock, recorded)
     log_frame_times(clock, recorded)
     log_words(clock, recorded)
@@ -120,7 +134,7 @@ def drawn_depth(image: DepthImage) -> rr.DepthImage:
     return rr.DepthImage(image.raw, meter=1.0 / image.unit_m, depth_range=(0.2 / image.unit_m, 2.0 / image.unit_m))
 
 
-def log_cloud(clock: Clock, scene: Scene, toss: Toss, look: Look, progress: Progress, camera: str = "d455") -> None:
+def log_cloud(clock: Clock, scene: Scene, toss: Toss, look: Look, steps: Steps, camera: str = "d455") -> None:
     """The coloured point cloud of every frame at the time its depth was exposed, in the root frame.
 
     Computed here through the lens model: rerun's pinhole knows no distortion. Left out where the camera's model or
@@ -130,11 +144,10 @@ def log_cloud(clock: Clock, scene: Scene, toss: Toss, look: Look, progress: Prog
     root_from_camera = scene.root_from(model.frame) if model is not None else None
     if model is None or root_from_camera is None:
         return
-    frames = toss.rgbd(camera)
     thin = Thinned.of(model, look.cloud_points)
-    for i, frame in enumerate(frames):
+    for frame in toss.rgbd(camera):
         clock.at(frame.depth_time_ns).log(CLOUD.format(camera), thin.cloud(frame, root_from_camera, look))
-        progress.step(i + 1, len(frames), f"toss {clock.toss}")
+        steps.next(f"toss {clock.toss}")
 
 
 @dataclass(frozen=True, eq=False)
