@@ -198,6 +198,13 @@ class _Walk:
             elif opcode == Opcode.CHANNEL:
                 definitions.append(mcap_scan.parse(body, Channel))
         for definition in definitions:
+            known = (self.found.schemas if isinstance(definition, Schema) else self.found.channels).get(definition.id)
+            if known is not None and known != definition:
+                kind = type(definition).__name__.lower()
+                raise ValueError(
+                    f"a chunk that defines {kind} {definition.id} otherwise than before: of another recording"
+                )
+        for definition in definitions:
             self._define(definition)
         self.chunks += 1
         self.after_bad_chunk = False

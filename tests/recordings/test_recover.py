@@ -119,6 +119,20 @@ def test_our_own_record_is_made_anew_when_just_that_was_lost(write_session, tmp_
         assert session.tosses == (2,)
 
 
+def test_two_recordings_in_one_file_are_not_mixed_up(tmp_path):
+    for name, topic in (("a.mcap", "/a"), ("b.mcap", "/b")):
+        with McapWriter(tmp_path / name) as writer:
+            writer.message(writer.channel(topic, "x", 0), 1, 1, 1, topic.encode())
+            writer.finish()
+    both = (tmp_path / "a.mcap").read_bytes()[:-30] + (tmp_path / "b.mcap").read_bytes()
+    (tmp_path / "both.mcap").write_bytes(both)
+    report = recover_file(tmp_path / "both.mcap", tmp_path / "c.mcap")
+    assert report.kept == {"/a": 1}
+    assert not report.whole
+    with McapFile(tmp_path / "c.mcap") as saved:
+        assert [m.data for m in saved.messages("/a")] == [b"/a"]
+
+
 @pytest.mark.parametrize("compression", list(CompressionType))
 @pytest.mark.parametrize("share", [0.2, 0.5, 0.9])
 def test_files_of_other_writers_are_recovered_too(tmp_path, compression, share):
