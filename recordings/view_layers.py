@@ -10,6 +10,7 @@ from jaxtyping import Float, Float32, Int64, UInt8
 from numpy import ndarray as Array
 
 from recordings.codec import decode_image
+from recordings.errors import BadInput, DamagedFile
 from recordings.geometry import CameraModel, Transform
 from recordings.progress import Progress
 from recordings.records import DepthImage, EncodedImage, HealthLine, RgbdFrame
@@ -138,16 +139,23 @@ def log_cloud(clock: Clock, scene: Scene, toss: Toss, look: Look, steps: Steps, 
     """The coloured point cloud of every frame at the time its depth was exposed, in the root frame.
 
     Computed here through the lens model: rerun's pinhole knows no distortion. Left out where the camera's model or
-    place is not known.
+    place is not known, or depth does not fit colour (a line among the events says so).
     """
     model = scene.calibration.cameras.get(camera)
     root_from_camera = scene.root_from(model.frame) if model is not None else None
     if model is None or root_from_camera is None:
         return
     thin = Thinned.of(model, look.cloud_points)
-    for frame in toss.rgbd(camera):
-        clock.at(frame.depth_time_ns).log(CLOUD.format(camera), thin.cloud(frame, root_from_camera, look))
-        steps.next(f"toss {clock.toss}")
+    frames = toss.rgbd(camera)
+    try:
+        for frame in frames:
+            clock.at(frame.depth_time_ns).log(CLOUD.format(camera), thin.cloud(frame, root_from_camera, look))
+            steps.next(f"toss {clock.toss}")
+    except DamagedFile:
+        raise
+    except BadInput as wrong:  # depth that cannot be laid over colour: all else is shown, and this is said
+        text = f"toss {clock.toss}: no point cloud: {wrong}"
+        clock.at(int(frames.times_ns[0])).log(EVENTS, rr.TextLog(text, level=rr.TextLogLevel.WARN))
 
 
 @dataclass(frozen=True, eq=False)

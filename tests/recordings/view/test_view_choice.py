@@ -7,9 +7,7 @@ import numpy as np
 import pytest
 
 from recordings.errors import BadInput
-from recordings.records import (
-    StampedPose,
-)
+from recordings.records import DepthImage, StampedPose
 from recordings.session_writer import SessionWriter
 from recordings.view import Choice, is_foreign, open_scene, save_rrd
 from recordings.view_layers import Look
@@ -45,6 +43,20 @@ def test_a_session_without_a_world_is_drawn_as_the_camera_sees_it(tiny, tmp_path
     np.testing.assert_allclose(np.array(points)[:, 2], 1.0, atol=1e-6)  # 1 m along the optical axis
     _, _, about = rrd.rows("/about", "TextDocument:text")[0]
     assert "as seen from d455" in about[0]
+
+
+def test_depth_that_does_not_fit_colour_gives_no_cloud_and_a_line_that_says_so(tiny, tmp_path):
+    with SessionWriter(tmp_path / "apart", {"name": "apart", "object": {"name": "block"}}, tiny.rig()) as writer:
+        with writer.toss(0) as toss:
+            toss.color(tiny.frame(0, 0))
+            toss.depth(DepthImage("d455", 0, 0, 0, 0.001, np.full((20, 30), 900, dtype=np.uint16)))
+        writer.finish("complete")
+    save_rrd(tmp_path / "apart", tmp_path / "a.rrd")
+    rrd = tiny.Rrd(tmp_path / "a.rrd")
+    assert not rrd.rows("/world/seen_by/d455", "Points3D:positions")
+    assert rrd.rows("/depth/d455", "DepthImage:buffer")
+    said = [text[0] for _, _, text in rrd.rows("/events", "TextLog:text")]
+    assert any("no point cloud" in text and "depth 30x20 and not aligned" in text for text in said)
 
 
 def test_poses_alone_give_a_box_a_path_and_plots(tiny, tmp_path):
