@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Float32, Int8
 from numpy import ndarray as Array
 
 from acquisition.synthetic.config import LightConfig
-from acquisition.synthetic.rays import Placed, Standing, Surface, cast, occluded, surface
+from acquisition.synthetic.rays import Placed, Standing, Surface, cast, joined, occluded, surface
 from recordings.geometry import CameraModel, Transform
 
 BEHIND_SLACK_M = 0.003
@@ -309,15 +309,19 @@ def _instant(
     rays = view.jittered(box, *jitter)
     z, owner, hits = nearest(placed, view, rays, [_rows(view, one, box) for one in placed])
     hidden = z > still.depth_m[box.slices].reshape(-1) + BEHIND_SLACK_M
-    for number, one in enumerate(placed):
-        rows = np.flatnonzero((owner == number) & ~hidden)
-        if len(rows) == 0:
-            continue
-        spot = surface(one, hits[number], rows, *_rays_of(view, rays, rows), _footprint(one, view, z[rows]))
+    owner[hidden] = -1
+    rows_of = [np.flatnonzero(owner == number) for number in range(len(placed))]
+    spots = [
+        surface(one, found, rows, *_rays_of(view, rays, rows), _footprint(one, view, z[rows]))
+        for one, found, rows in zip(placed, hits, rows_of)
+        if len(rows)
+    ]
+    if spots:
+        spot = joined(spots)
         ambient, key, fill = light.parts(spot, view.origin_m, lamps)
         key[occluded(placed, spot.points_m, lamps.key_m, spot.normals)] = 0
         fill[occluded(placed, spot.points_m, lamps.fill_m, spot.normals)] = 0
-        seen[rows] = ambient + key + fill
+        seen[np.concatenate(rows_of)] = ambient + key + fill
     return seen.reshape(box.y1 - box.y0, box.x1 - box.x0, 3)
 
 

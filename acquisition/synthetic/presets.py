@@ -33,6 +33,7 @@ BOX = _object("box", "textured", "speckled")
 TOSSED_BY_ARM = replace(
     _object("prism", "textured", mass_kg=0.12),
     arm=ArmConfig(),
+    color=ColorConfig(subframes=6),
     camera=CameraConfig(distance_m=0.95, distortion=(-0.055, 0.065, 0.0006, -0.0004, -0.02)),
     motion=MotionConfig(release_height_m=0.3, forward_speed_m_s=0.7, upward_speed_m_s=0.45, spin_rad_s=4.0),
 )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 
 import cv2
@@ -110,6 +110,11 @@ class Surface:
     reflectance: Float32[Array, " n"]
     exponent: Float32[Array, " n"]
     mirror: Float32[Array, " n"]
+
+
+def joined(surfaces: Sequence[Surface]) -> Surface:
+    """Hits of several bodies, one after the other."""
+    return Surface(*(np.concatenate([getattr(s, f.name) for s in surfaces]) for f in fields(Surface)))
 
 
 def cast(placed: Placed, origins_m: Float32[Array, "n 3"], directions: Float32[Array, "n 3"]) -> dict[str, Array]:

@@ -15,8 +15,9 @@ PUPIL_SHIFT_PX = 0.5
 """pupil-apriltags' pixel centres lie at half integers, OpenCV's at integers."""
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def detector():
+    """One for the whole run: pupil-apriltags corrupts the heap when detectors that saw busy images are destroyed."""
     return pupil_apriltags.Detector(families="tag36h11", quad_decimate=1.0)
 
 
