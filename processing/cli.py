@@ -128,6 +128,7 @@ def _evaluate(args: argparse.Namespace, session: Session, out: Path) -> Outcome:
     """Scores of all variants in the results folder, table and report."""
     from processing.report import write_report
     from processing.score import score_variant
+    from processing.stage import locked
     from processing.table import collect, markdown, write_table
     from processing.truth import open_truth
     from recordings.results import Results
@@ -140,8 +141,9 @@ def _evaluate(args: argparse.Namespace, session: Session, out: Path) -> Outcome:
         if truth is not None:
             scores[variant] = score_variant(results, record, truth)
     rows = collect(results, scores)
-    document = write_table(results, rows)
-    write_report(results, document, rows, session)
+    with locked(out / ".table.lock"):  # of two runs on one folder, each writes a whole table
+        document = write_table(results, rows)
+        write_report(results, document, rows, session)
     text = f"{markdown(document)}\nresults: {out}\nreport:  {out / 'report.html'}"
     return Outcome({"session": session.name, "results": str(out), **document}, text)
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,11 +18,12 @@ from processing.config import Config
 from processing.segment.background import BackgroundSegmenter
 from processing.segment.segmenter import Example
 from processing.segment.static_scene import StaticScene, calibrated_table_depth, learn_scene, sample_positions
-from processing.stage import Counts, Done, Store
+from processing.stage import Counts, Done, Store, locked
 from processing.track.frame_to_model import FrameToModel
 from processing.variants import Variant
 from recordings.errors import BadInput
 from recordings.progress import Progress
+from recordings.records import RgbdFrame
 from recordings.results import (
     Scope,
     TossRecord,
@@ -92,7 +93,8 @@ def process(run: Run, variant: Variant, scope: Scope) -> VariantRecord:
         notes=(f"tracker: {run.tracker}", "each toss has its own object frame"),
         extra={"tracker": run.tracker},
     )
-    write_variant(run.store.results, record)
+    with locked(run.store.results / ".variants.lock"):
+        write_variant(run.store.results, record)
     return record
 
 
@@ -107,7 +109,7 @@ def _learn_scene(run: Run, folder: Path) -> Counts:
     chosen = sample_positions([len(s) for s in streams], run.config.scene.frames)
     progress = run.progress("static scene")
 
-    def frames():  # type: ignore[no-untyped-def]
+    def frames() -> Iterator[RgbdFrame]:
         for done, (toss, position) in enumerate(chosen):
             progress.step(done, len(chosen))
             yield streams[toss][position]

@@ -80,7 +80,7 @@ class Store:
         folder = self.results / f"{stage}-{key[:SHOWN]}"
         if (found := _finished(folder, key)) is not None:
             return found
-        with _spoken(self.results), _locked(self.results / f".{folder.name}.lock"):
+        with _spoken(self.results), locked(self.results / f".{folder.name}.lock"):
             if (found := _finished(folder, key)) is not None:  # made by another run while this one waited
                 return found
             partial = folder.with_name(folder.name + ".partial")
@@ -129,7 +129,7 @@ def _finished(folder: Path, key: str) -> Done | None:
 
 
 @contextmanager
-def _locked(path: Path) -> Iterator[None]:
+def locked(path: Path) -> Iterator[None]:
     """Held by one process at a time; the system lets go of it however the holder ends."""
     while True:
         with open(path, "w") as lock:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any
 
 from processing.score import TossScore, VariantScore
@@ -125,7 +124,3 @@ def _finite(value: Any) -> Any:
     """Strict JSON: an infinite error of a lost frame has no number."""
     text = json.dumps(value)
     return json.loads(text, parse_constant=lambda _: None)
-
-
-def table_path(results: Path) -> Path:
-    return results / "table.md"

@@ -49,8 +49,8 @@ class FrameToModelSettings:
     """Below this share, the other starting rotation is tried as well."""
     border_px: int = 1
     """Depth this near to the mask's border is not used: it may be the background's."""
-    point_share: float = 1.0
-    """Weight of point-to-point residuals beside point-to-plane's 1."""
+    most_steps: int = 20
+    """Steps of either round."""
     still: float = 2e-5
     """ICP ends when a step is smaller than this (rad, m)."""
     edge_m: float = 0.012
@@ -298,18 +298,18 @@ def align_to_surface(
 ) -> _Fit:
     """Two rounds of ICP of camera points to the model: Gauss-Newton on point-to-plane residuals (Chen, Medioni 1992).
 
-    A share of point-to-point residuals holds the directions in which the surface slides along itself.
+    Where the visible faces slide along themselves, nothing holds them: that is this baseline's weakness.
     """
     tree = cKDTree(surface.points_m)
     at = object_from_camera
-    for reach, most, part in ((s.coarse_m, 20, points_m[::3]), (s.fine_m, 20, points_m)):
-        for _ in range(most):
+    for reach, part in ((s.coarse_m, points_m[::3]), (s.fine_m, points_m)):
+        for _ in range(s.most_steps):
             moved = part @ at[:3, :3].T + at[:3, 3]
             distance, nearest = tree.query(moved, distance_upper_bound=reach)
             near = np.isfinite(distance)
             if near.sum() < 10:
                 break
-            step = _gauss_newton(moved[near], surface, nearest[near], s.point_share)
+            step = _gauss_newton(moved[near], surface, nearest[near])
             at = _exp(step) @ at
             if float(np.abs(step).max()) < s.still:
                 break
@@ -322,18 +322,12 @@ def align_to_surface(
     return _Fit(at, len(near) / len(points_m), rmse, pairs)
 
 
-def _gauss_newton(
-    moved_m: Float[Array, "k 3"], surface: Surface, nearest: Int[Array, " k"], point_share: float
-) -> Float[Array, "6"]:
+def _gauss_newton(moved_m: Float[Array, "k 3"], surface: Surface, nearest: Int[Array, " k"]) -> Float[Array, "6"]:
     """The step (rotation vector, translation) that brings moved points onto the planes of their nearest points."""
     normals, gap = surface.normals[nearest], moved_m - surface.points_m[nearest]
     rows = np.hstack([np.cross(moved_m, normals), normals])
     hessian = rows.T @ rows
     gradient = rows.T @ (gap * normals).sum(1)
-    for axis in np.eye(3) if point_share > 0 else ():
-        towards = np.hstack([np.cross(moved_m, axis), np.broadcast_to(axis, moved_m.shape)])
-        hessian += point_share * towards.T @ towards
-        gradient += point_share * towards.T @ (gap @ axis)
     return -np.linalg.solve(hessian + 1e-9 * np.trace(hessian) * np.eye(6), gradient)
 
 

@@ -168,6 +168,16 @@ def test_a_run_killed_in_the_middle_resumes_to_the_same_table(record_tiny: Recor
     assert (tmp_path / "killed" / "table.json").read_text() == (tmp_path / "whole" / "table.json").read_text()
 
 
+def test_two_runs_at_once_on_one_results_folder_both_finish(record_tiny: Record, tmp_path: Path) -> None:
+    session, out = record_tiny(tosses=(0,), frames=5), tmp_path / "out"
+    code = "import sys; from processing.cli import main; sys.exit(main(sys.argv[1:]))"
+    command = [sys.executable, "-c", code, str(session), "--out", str(out)]
+    runs = [subprocess.Popen(command, stdout=subprocess.DEVNULL) for _ in range(2)]
+    assert [run.wait(timeout=300) for run in runs] == [0, 0]
+    assert len(list(out.glob("track-*"))) == 1
+    assert not [p.name for p in out.rglob("*") if p.suffix in (".partial", ".lock")]
+
+
 def test_only_the_chosen_tosses_are_processed(record_tiny: Record, capsys: pytest.CaptureFixture[str]) -> None:
     session = record_tiny(tosses=(0, 3))
     answers(capsys, session, "--toss", "3")

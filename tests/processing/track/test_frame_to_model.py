@@ -12,7 +12,7 @@ from processing.metrics import align_first, frame_errors
 from processing.track.frame_to_model import FrameToModel
 from processing.track.tracker import Tracked
 from recordings.errors import BadInput
-from recordings.geometry import CameraModel
+from recordings.geometry import CameraModel, rotation_angle_rad
 from recordings.progress import Silent
 from recordings.records import RgbdFrame
 
@@ -105,10 +105,13 @@ def test_depth_of_zero_in_the_mask_is_lost(tiny_world: Any, toss: Any) -> None:
     assert track(tiny_world, blind, masks).track.status[3] == "lost"
 
 
-def test_identical_frames_do_not_drift(tiny_world: Any, toss: Any) -> None:
+def test_identical_frames_hardly_drift(tiny_world: Any, toss: Any) -> None:
+    """Not zero: each fusion moves the surface by a fraction of its 2 mm voxels, on an object of 40 pixels."""
     frames, masks, _ = toss
     found = track(tiny_world, frames[:1] * 6, masks[:1] * 6).track
-    np.testing.assert_allclose(found.camera_from_object[-1], found.camera_from_object[0], atol=6e-3)
+    last, first = found.camera_from_object[-1], found.camera_from_object[0]
+    assert np.degrees(rotation_angle_rad(last[:3, :3] @ first[:3, :3].T)) < 1.0
+    assert np.linalg.norm(last[:3, 3] - first[:3, 3]) < 0.001
 
 
 def test_one_frame_gives_one_pose_and_a_surface(tiny_world: Any, toss: Any) -> None:
