@@ -61,7 +61,7 @@ def fall_m_s2(tosses: Sequence[PoseSeries], frames: int = 6) -> float | None:
             left = p - np.polynomial.polynomial.polyval(t - t.mean(), fit).T
             bend = 2 * fit[2]
             falls = bend[2] * (t[-1] - t[0]) ** 2 / 8
-            if -falls > 8 * np.abs(left).max() and abs(bend[2]) > 20 * np.abs(bend[:2]).max():
+            if abs(falls) > 8 * np.abs(left).max() and abs(bend[2]) > 20 * np.abs(bend[:2]).max():
                 found.append(float(bend[2]))
     return float(np.median(found)) if len(found) >= 3 else None
 
@@ -154,7 +154,7 @@ def check_velocities(tosses: Sequence[PoseSeries]) -> None:
 Gaps = tuple[float, dict[str, float]]
 
 
-def _median_gap(pairs: Sequence[tuple[Float[Array, "n 3"], Float[Array, "n 3"]]]) -> float:
+def _median_gap(pairs: Sequence[tuple[Array, Array]]) -> float:
     return float(np.median(np.concatenate([np.linalg.norm(a - b, axis=1)[1:] for a, b in pairs])))
 
 

@@ -5,6 +5,7 @@ Layout of a parameter vector: shape | square root of friction | inertia (6) | ce
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -23,6 +24,10 @@ SHAPE, FRICTION, INERTIA, CENTER, PLANE = slice(None, -11), -11, slice(-10, -4),
 """Where a parameter vector keeps what."""
 LOSS_SCALE = 1e4
 """Brings the loss (J) to order one for the optimisers' tolerances."""
+TOLERANCE, ROUGH_TOLERANCE = 1e-7, 3e-6
+"""L-BFGS ends when the loss falls by less than this, relatively; rough for fits that only compare."""
+MOST_MOVE, MOST_FRICTION = 1.5, 2.0
+"""How far a parameter may go from its start (a length: 75 mm): a first step of L-BFGS knows no scale."""
 
 
 @dataclass(frozen=True)
@@ -123,33 +128,40 @@ class _Objective:
         scaled = value.loss * LOSS_SCALE
         if scaled.requires_grad:
             scaled.backward()
-        if self.free.grad is None:
-            self.free.grad = torch.zeros_like(self.free)
         self.evaluations += 1
         self.last_failures = int(value.impulses.failed.sum())
         self.failures += self.last_failures
         return scaled.detach()
 
-    def fit(self, loss: float) -> Fit:
-        ended = self.parameters().detach().cpu().numpy()
-        return Fit(ended, loss / LOSS_SCALE, self.evaluations, self.failures, self.last_failures)
+    def gradient(self) -> Float[Tensor, " q"]:
+        return torch.zeros_like(self.free) if self.free.grad is None else self.free.grad
+
+    def ended(self, free: Float[Array, " q"], loss: float) -> Fit:
+        with torch.no_grad():
+            self.free.copy_(torch.as_tensor(free))
+        found = self.parameters().detach().cpu().numpy()
+        return Fit(found, loss / LOSS_SCALE, self.evaluations, self.failures, self.last_failures)
 
 
-def fit_lbfgs(
-    model: Model, start: Float[Array, " p"], data: StepData, weights: Weights, iterations: int
-) -> Fit:
-    """Full-batch L-BFGS with a strong Wolfe line search."""
+def fit_lbfgs(model: Model, start: Float[Array, " p"], data: StepData, weights: Weights, iterations: int, tolerance: float = TOLERANCE) -> Fit:
+    """Full-batch L-BFGS (scipy's: importing torch.optim costs a CPU second)."""
+    from scipy.optimize import minimize
+
     objective = _Objective(model, start, data, weights)
-    optimiser = torch.optim.LBFGS(
-        [objective.free],
-        max_iter=iterations,
-        history_size=20,
-        line_search_fn="strong_wolfe",
-        tolerance_grad=1e-5,
-        tolerance_change=1e-6,
-    )
-    optimiser.step(objective)
-    return objective.fit(float(objective()))
+
+    def value(free: Float[Array, " q"]) -> tuple[float, Float[Array, " q"]]:
+        with torch.no_grad():
+            objective.free.copy_(torch.as_tensor(free))
+        loss = float(objective())
+        return loss, objective.gradient().cpu().numpy()
+
+    begin = objective.free.detach().cpu().numpy().copy()
+    friction = int(model.learned()[:FRICTION].sum())
+    bounds = [(x - MOST_MOVE, x + MOST_MOVE) for x in begin]
+    bounds[friction] = (0.0, MOST_FRICTION**0.5)
+    options = {"maxiter": iterations, "ftol": tolerance, "gtol": 1e-5, "maxcor": 20}
+    found = minimize(value, begin, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
+    return objective.ended(found.x, float(found.fun))
 
 
 def fit_adam(
@@ -161,24 +173,29 @@ def fit_adam(
     rate: float,
     told: Callable[[int, float], None] | None = None,
 ) -> Fit:
-    """Full-batch Adam with a cosine schedule: free points make the loss too kinked for L-BFGS."""
+    """Full-batch Adam (Kingma and Ba 2015) with a cosine schedule: free points make the loss too kinked for L-BFGS."""
     objective = _Objective(model, start, data, weights)
-    optimiser = torch.optim.Adam([objective.free], lr=rate)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, iterations)
+    mean, square = torch.zeros_like(objective.free), torch.zeros_like(objective.free)
     loss = float("nan")
     for i in range(iterations):
         loss = float(objective())
-        optimiser.step()
-        schedule.step()
+        slope = objective.gradient()
+        mean = 0.9 * mean + 0.1 * slope
+        square = 0.999 * square + 0.001 * slope * slope
+        now = 0.5 * rate * (1 + math.cos(math.pi * i / iterations))
+        step = (mean / (1 - 0.9 ** (i + 1))) / ((square / (1 - 0.999 ** (i + 1))).sqrt() + 1e-8)
+        with torch.no_grad():
+            objective.free.sub_(now * step)
         if told is not None:
             told(i, loss / LOSS_SCALE)
-    return objective.fit(loss)
+    return objective.ended(objective.free.detach().cpu().numpy(), loss)
 
 
 def fit(model: Model, start: Float[Array, " p"], data: StepData, weights: Weights, share: float = 1.0) -> Fit:
     """Fit with the optimiser of the geometry. `share` of the iterations is enough from a start near the optimum."""
     config = model.config
     if model.geometry.name == "box":
-        return fit_lbfgs(model, start, data, weights, max(4, round(config.lbfgs_iterations * share)))
+        tolerance = TOLERANCE if share == 1.0 else ROUGH_TOLERANCE
+        return fit_lbfgs(model, start, data, weights, max(4, round(config.lbfgs_iterations * share)), tolerance)
     iterations = max(8, round(config.adam_iterations * share))
     return fit_adam(model, start, data, weights, iterations, config.adam_rate * (1.0 if share == 1.0 else 0.3))

@@ -8,7 +8,7 @@ Points are in object axes, relative to the centre of mass of the prior.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -25,6 +25,7 @@ GeometryName = Literal["box", "hull", "nonconvex"]
 CORNERS = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
 
 
+@runtime_checkable
 class Geometry(Protocol):
     """What the fit asks of a shape: a parameter vector (without unit, of order one) and the points it stands for."""
 

@@ -66,7 +66,7 @@ def bootstrap(
     weights: Weights,
     repeats: int,
     seed: int,
-    share: float = 0.2,
+    share: float = 0.12,
     told: Callable[[int, int], None] = lambda done, total: None,
 ) -> Spread:
     """Repeat the fit on tosses drawn with replacement."""

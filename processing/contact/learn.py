@@ -56,7 +56,7 @@ class ContactConfig:
     """None: chosen by held-out rollouts (SweepConfig). `Weights()` are the paper's."""
     one_toss_dissipation: float = 30.0
     """Of a single toss, from which nothing can be held out."""
-    bootstrap_repeats: int = 20
+    bootstrap_repeats: int = 16
     rollout_steps: int = 80
     rollout_step_s: float = 1 / 148
     smooth: bool = True
@@ -241,8 +241,7 @@ def _rest_heights(prepared: Prepared, points_m: Float[Array, "v 3"]) -> dict[int
 
 
 def _check_learned_plane(prepared: Prepared, body: Body) -> None:
-    points = body.points_m.cpu().numpy() - np.array([0.0, 0.0, 0.0])
-    checks.check_plane(_rest_heights(prepared, points), "the learned shape")
+    checks.check_plane(_rest_heights(prepared, body.points_m.cpu().numpy()), "the learned shape")
 
 
 def _steps(prepared: Prepared, config: ContactConfig) -> Steps:

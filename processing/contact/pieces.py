@@ -15,73 +15,76 @@ GOOD_ENOUGH = 0.97
 """Share of the pieces' hulls that the mesh must fill; below it the worst piece is cut."""
 CUTS = 9
 """Planes tried per axis."""
+LEAST_GAIN = 0.01
+"""Share of the mesh's volume that a cut must save."""
 
 
 def convex_pieces(vertices_m: Float[Array, "v 3"], faces: Int[Array, "f 3"], points: int = 64) -> FreePoints:
-    """Cut a mesh by axis-aligned planes (of its principal axes) until the pieces' hulls are nearly the mesh.
+    """Cut a mesh by planes along its principal axes until the pieces' hulls are nearly the mesh.
 
-    Greedy: of all cuts of the piece with most empty hull, the one that leaves the least total hull volume. `points` is the
-    most support points of all pieces together.
+    Greedy: the cut of any piece that leaves the least total hull volume. `points` is the most support points of all
+    pieces together. Only the pieces' hulls are wanted, so cuts are left open.
     """
     import trimesh
 
     mesh = trimesh.Trimesh(vertices_m, faces, process=True)
-    axes = _axes(mesh)
-    parts = [mesh]
-    filled = abs(float(mesh.volume))
-    while len(parts) < MOST_PIECES and filled < GOOD_ENOUGH * sum(_hull_volume(p.vertices) for p in parts):
-        cuts = [(_gain(p, axes), i) for i, p in enumerate(parts)]
-        (gain, halves), at = max(cuts, key=lambda c: c[0][0])
-        if gain <= 0.01 * filled or not halves:
+    box_from_mesh, _ = trimesh.bounds.oriented_bounds(mesh)
+    axes, filled = np.asarray(box_from_mesh)[:3, :3], abs(float(mesh.volume))
+    parts = [np.asarray(mesh.triangles, dtype=np.float64)]
+    while len(parts) < MOST_PIECES and filled < GOOD_ENOUGH * sum(map(_hull_volume, parts)):
+        gain, at, halves = max((_best_cut(p, i, axes) for i, p in enumerate(parts)), key=lambda c: c[0])
+        if gain <= LEAST_GAIN * filled:
             break
         parts[at : at + 1] = halves
     each = max(8, points // len(parts))
-    found = [support_points(np.asarray(p.vertices), each) for p in parts]
+    found = [support_points(p.reshape(-1, 3), each) for p in parts]
     ends = np.cumsum([len(p) for p in found])
     groups = tuple(tuple(range(int(e) - len(p), int(e))) for p, e in zip(found, ends))
     return FreePoints(np.concatenate(found), groups)
 
 
-def _axes(mesh: object) -> Float[Array, "3 3"]:
-    """Principal axes of the oriented bounding box, as rows."""
-    import trimesh
-
-    box_from_mesh, _ = trimesh.bounds.oriented_bounds(mesh)
-    return np.asarray(box_from_mesh)[:3, :3]
-
-
-def _hull_volume(points: Float[Array, "v 3"]) -> float:
-    points = np.asarray(points)
+def _hull_volume(triangles: Float[Array, "t 3 3"]) -> float:
+    points = triangles.reshape(-1, 3)
     if len(points) < 4 or np.linalg.matrix_rank(points - points.mean(0), tol=1e-7) < 3:
         return 0.0
     return float(ConvexHull(points).volume)
 
 
-def _gain(part: object, axes: Float[Array, "3 3"]) -> tuple[float, list]:
-    """The hull volume that the best cut of a part saves, and the two halves."""
-    import trimesh
+Cut = tuple[float, int, list[Float[Array, "t 3 3"]]]
 
-    whole = _hull_volume(part.vertices)  # type: ignore[attr-defined]
-    best: tuple[float, list] = (0.0, [])
+
+def _best_cut(triangles: Float[Array, "t 3 3"], at: int, axes: Float[Array, "3 3"]) -> Cut:
+    """The hull volume that the best cut of a part saves, which part it is, and its halves."""
+    whole = _hull_volume(triangles)
+    best: Cut = (0.0, at, [])
     for axis in axes:
-        along = part.vertices @ axis  # type: ignore[attr-defined]
-        for share in np.linspace(0, 1, CUTS + 2)[1:-1]:
-            origin = axis * (along.min() + share * np.ptp(along))
-            best = max(best, _cut(part, axis, origin, whole), key=lambda c: c[0])
-        # edges of the mesh are where concave bodies change: try the planes through its vertices too, where they are few
-        for level in np.unique(np.round(along, 6))[:40]:
-            best = max(best, _cut(part, axis, axis * level, whole), key=lambda c: c[0])
+        heights = triangles @ axis
+        levels = np.linspace(heights.min(), heights.max(), CUTS + 2)[1:-1]
+        own = np.unique(np.round(heights, 5))  # concave bodies change at their edges: planes through vertices, if few
+        for level in (*levels, *(own if len(own) <= 40 else ())):
+            halves = [_above(triangles, side * axis, side * level) for side in (1.0, -1.0)]
+            volumes = [_hull_volume(h) for h in halves]
+            if min(volumes) > 0 and whole - sum(volumes) > best[0]:
+                best = (whole - sum(volumes), at, halves)
     return best
 
 
-def _cut(part: object, axis: Float[Array, "3"], origin: Float[Array, "3"], whole: float) -> tuple[float, list]:
-    import trimesh
-
-    halves = [trimesh.intersections.slice_mesh_plane(part, side * axis, origin) for side in (1.0, -1.0)]
-    volumes = [_hull_volume(h.vertices) for h in halves]
-    if min(volumes) <= 0:
-        return 0.0, []
-    return whole - sum(volumes), halves
+def _above(triangles: Float[Array, "t 3 3"], axis: Float[Array, "3"], level: float) -> Float[Array, "t 3 3"]:
+    """The part of the triangles with axis . x >= level, triangulated."""
+    heights = triangles @ axis - level
+    kept = [triangles[(heights >= 0).all(1)]]
+    for triangle, height in zip(triangles, heights):
+        if (height > 1e-9).any() and (height < -1e-9).any():
+            polygon = []
+            for i in range(3):
+                j = (i + 1) % 3
+                if height[i] >= 0:
+                    polygon.append(triangle[i])
+                if (height[i] > 0) != (height[j] > 0):
+                    share = height[i] / (height[i] - height[j])
+                    polygon.append(triangle[i] + share * (triangle[j] - triangle[i]))
+            kept += [np.array([[polygon[0], polygon[k], polygon[k + 1]]]) for k in range(1, len(polygon) - 1)]
+    return np.concatenate(kept)
 
 
 def carried(

@@ -19,9 +19,9 @@ from torch import Tensor
 MOST_ITERATIONS = 100
 TOLERANCE = 1e-8
 """Of the momentum balance |v - A' lam|, relative to both."""
-FLAT_ENOUGH = 0.2
+FLAT_ENOUGH = 0.5
 """A line search ends where the slope along the line has fallen to this share."""
-SEARCH_STEPS = 20
+SEARCH_STEPS = 8
 
 
 @dataclass(frozen=True, eq=False)

@@ -28,8 +28,8 @@ class SweepConfig:
     """Dissipation weights tried at once."""
     further: tuple[float, ...] = (17.0, 55.0, 3.0, 1.0)
     """Tried when they lie beside the best one so far."""
-    folds: int = 4
-    share: float = 0.3
+    folds: int = 3
+    share: float = 0.2
     """Of a full fit's iterations, for the fits of the folds (they start at the fit to all tosses)."""
 
 
