@@ -33,7 +33,8 @@ def toss_name(toss: int) -> str:
 
 
 class TossWriter:
-    """One file of a session, complete in itself. As a context: finished on a clean exit, left recoverable otherwise."""
+    """One file of a session, complete in itself. As a context: finished on a clean exit and on Ctrl-C (its stop record
+    then says `interrupted`), left recoverable after an error."""
 
     def __init__(
         self, path: Path, start: Mapping[str, Any], calibration: RigCalibration, kind: str, info: Mapping[str, Any]
@@ -61,7 +62,10 @@ class TossWriter:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *exc: object) -> None:
-        if kind is not None:
+        if kind is not None and issubclass(kind, KeyboardInterrupt) and self.sha256 is None:
+            with contextlib.suppress(WriteFailed):  # Ctrl-C: everything so far is kept, as a whole file
+                self.finish("interrupted")
+        elif kind is not None:
             self.abandon()
         elif self.sha256 is None:
             self.finish()
@@ -133,13 +137,13 @@ class TossWriter:
         self._ended = True
         self._writer.abandon()
 
-    def finish(self) -> str:
+    def finish(self, status: str = "complete") -> str:
         """Write counts and index, close, return the file's sha256. Raises WriteFailed and keeps what the disk took."""
         if self.sha256 is not None:
             return self.sha256
         try:
             self._begin(0)
-            self._writer.metadata("tosslab.stop", {"status": "complete", "streams": json.dumps(self.streams())})
+            self._writer.metadata("tosslab.stop", {"status": status, "streams": json.dumps(self.streams())})
             self.sha256 = self._writer.finish()
         except WriteFailed:
             self.abandon()

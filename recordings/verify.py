@@ -118,6 +118,9 @@ def _check_counts(structure: Structure) -> Iterator[Finding]:
     if not streams and structure.topics:
         yield Finding("error", structure.name, "its stop record cannot be read")
         return
+    status = stops[-1].get("status", "")
+    if status not in ("complete", "recovered"):
+        yield Finding("warning", structure.name, f"was not recorded to its end: status {status!r}")
     yield from _compare_counts(structure, streams)
 
 
