@@ -122,7 +122,7 @@ def _learn_rows(
 
 def _color_median(colors: Array, empty: Bool[Array, "n h w"]) -> tuple[Float32[Array, "h w 3"], Float32[Array, "h w"]]:
     """Median colour over the frames in which a pixel shows the scene (over all, where it never does), and its noise."""
-    use = empty | ~empty.any(0)[None]
+    use = empty | ~empty.any(0, keepdims=True)
     color = np.stack([_masked_median(colors[..., k].astype(np.float32), use) for k in range(3)], -1)
     spread = np.abs(colors.astype(np.float32) - color).max(-1)
     return color, (1.48 * _masked_median(spread, use)).astype(np.float32)

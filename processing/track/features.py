@@ -59,7 +59,7 @@ class Sift:
 
     def __init__(self, config: SiftConfig | None = None) -> None:
         self.config = config or SiftConfig()
-        self._sift = cv2.SIFT_create(
+        self._sift = cv2.SIFT.create(
             nfeatures=self.config.most, contrastThreshold=self.config.contrast, edgeThreshold=self.config.edge
         )
 
