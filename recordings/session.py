@@ -317,11 +317,12 @@ def _open_folder(path: Path) -> Session:
         if file.stem[5:].isdigit():
             files[int(file.stem[5:])] = file
     document_path = path / "session.json"
-    if not document_path.exists():
-        hint = (
-            " It looks like the folder layout: `toss-session import folder`." if list(path.glob("toss_*/rgb")) else ""
+    if not files and list(path.glob("toss_*/rgb")):
+        raise BadInput(
+            f"{path} is a folder layout, not yet a session; bring it in: `toss-session import folder {path} NEW_SESSION`"
         )
-        raise BadInput(f"{path} has no session.json, so it is no session.{hint}")
+    if not document_path.exists():
+        raise BadInput(f"{path} has no session.json, so it is no session")
     document = read_document(document_path)
     calibration_path = path / "calibration.json"
     if calibration_path.exists():

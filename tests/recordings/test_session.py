@@ -354,3 +354,10 @@ def test_strange_values_anywhere_in_the_documents_give_plain_errors(write_sessio
                 pass
         recover(folder, tmp_path / f"saved_{i}")
         assert verify(tmp_path / f"saved_{i}").ok
+
+
+def test_a_folder_layout_that_was_not_imported_says_how(tmp_path):
+    (tmp_path / "toss_00" / "rgb").mkdir(parents=True)
+    (tmp_path / "session.json").write_text('{"object": "cube"}')
+    with pytest.raises(BadInput, match="toss-session import folder"):
+        Session.open(tmp_path)
