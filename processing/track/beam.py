@@ -16,13 +16,13 @@ from numpy import ndarray as Array
 from processing.track import kernels as k
 from processing.track.features import FeatureMatcher, Features, RansacConfig, relative_motions
 from processing.track.keyframes import KeyframeConfig, is_new, references
-from processing.track.motion import MotionConfig, change_cost, moved, turn_between
+from processing.track.motion import MotionConfig, change_cost, moved, steady_spin, turn_between
 from processing.track.views import ViewStore
 from recordings.geometry import rotation_exp
 
 Schedule = tuple[tuple[float, float, float, float, float, float], ...]
-"""Rows of kernels.align_view: level (0 sharp, 1 smooth), steps, depth scale (m at 0.8 m), grey scale, outline scale (m at
-0.8 m), share of the samples."""
+"""Rows of kernels.align_view: level (0 sharp, 1 smooth), steps, depth scale (m at 0.8 m), scale of the looks, outline
+scale (m at 0.8 m), share of the samples."""
 
 USUAL_DISTANCE_M = 0.8
 LEAST_DELAY_S = 0.0003
@@ -46,14 +46,14 @@ class BeamConfig:
     """A frame whose best fit costs more even then asks for the grid of turns."""
     lost: float = 0.33
     """A frame whose best fit costs more is no basis for others."""
-    least_on_surface: float = 0.35
+    least_on_surface: float = 0.15
     apart_deg: float = 6.0
     """Nearer candidates are the same."""
     spread: float = 0.35
     """Worse than the best by more than this: dropped."""
     grid_deg: tuple[float, ...] = (20.0, 40.0, 65.0)
     grid_axes: int = 20
-    hold: float = 20.0
+    hold: float = 60.0
     """The pull towards the foretold pose weighs as much as so many independent samples ..."""
     hold_deg: float = 2.0
     hold_m: float = 0.01
@@ -158,7 +158,7 @@ def follow(
 
 
 def _put_at_color_time(scene: Scene, h: Hypothesis, i: int) -> None:
-    """Where depth is exposed at another time than colour: make the view with the motion that the last poses foretell."""
+    """Where depth is exposed at another time than colour: make the view with the motion that the poses foretell."""
     crop, tracked = scene.store.crops[i], [j for j in h.tracked if j != i]
     if crop is None or abs(crop.depth_delay_s) < LEAST_DELAY_S or len(tracked) < 2 or np.isfinite(h.poses[i, 0, 0]):
         return
@@ -244,7 +244,9 @@ def _usual_starts(scene: Scene, h: Hypothesis, i: int) -> list[tuple[str, Float[
     if len(tracked) > 1:
         a, b = tracked[-2], tracked[-1]
         step_s, next_s = scene.times_s[b] - scene.times_s[a], scene.times_s[i] - scene.times_s[b]
-        prior = moved(h.poses[a], last, step_s, next_s, scene.center_m, scene.gravity_camera_m_s2)
+        recent = list(tracked[-6:])
+        spin = steady_spin(h.poses[recent], scene.times_s[recent])
+        prior = moved(h.poses[a], last, step_s, next_s, scene.center_m, scene.gravity_camera_m_s2, spin)
         on_cloud = prior.copy()
         on_cloud[:3, 3] = last[:3, 3] + shift
         starts = [*starts, ("prior", prior), ("prior on cloud", on_cloud)]

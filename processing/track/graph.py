@@ -18,7 +18,7 @@ from processing.track.beam import Schedule, rows
 from processing.track.keyframes import view_directions
 from processing.track.motion import turn_between
 from processing.track.views import ViewStore
-from recordings.geometry import skew
+from recordings.geometry import rotation_log, skew
 
 
 @dataclass(frozen=True)
@@ -35,14 +35,19 @@ class GraphConfig:
     schedule: Schedule = (
         (1, 2, 0.006, 0.4, 0.008, 0.3),
         (0, 3, 0.004, 0.4, 0.006, 0.5),
-        (0, 5, 0.0025, 0.3, 0.005, 1.0),
+        (0, 3, 0.003, 0.15, 0.005, 1.0),
+        (0, 5, 0.0035, 0.08, 0.005, 1.0),
     )
+    """The last row weighs looks more: their errors are a tenth of a pixel, those of depth are shared by whole patches."""
     sure_cost: float = 0.08
     """A pair that fits worse counts less."""
     spin_change_rad_s: float = 0.7
     """Standard deviation of the change of spin between frames in flight (not an impact)."""
     velocity_change_m_s: float = 0.06
     """... and of the velocity beyond gravity's share."""
+    still_rad: float = 0.003
+    still_m: float = 0.0002
+    """What a body that stands still may move between frames (standard deviation)."""
     shared_noise: float = 8.0
     """A view's pairs share its noise: together they count as one, so many times over."""
 
@@ -56,6 +61,8 @@ class Motion:
     toss: Int[Array, " n"]
     gravity_camera_m_s2: Float[Array, "3"]
     center_m: Float[Array, "3"]
+    still: Bool[Array, " n"]
+    """Whether the object stands still between each view and the one before it in its toss."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +80,7 @@ def choose_pairs(
     poses: Float[Array, "n 4 4"], use: Bool[Array, " n"], toss: Int[Array, " n"], center_m: Float[Array, "3"],
     config: GraphConfig,
 ) -> Int[Array, "m 2"]:  # fmt: skip
-    """Pairs (i, k) in both directions: neighbours in time, and views from near directions spread over time and tosses."""
+    """Pairs (i, k), both ways: neighbours in time, and views from near directions spread over time and tosses."""
     index = np.flatnonzero(use)
     directions = view_directions(poses[index], center_m)
     cosine = np.clip(directions @ directions.T, -1, 1)
@@ -155,15 +162,16 @@ def _add_motion(
     place: Int[Array, " n"], motion: Motion, config: GraphConfig,
 ) -> None:  # fmt: skip
     """Adds the pull towards constant spin and ballistic centre over each three views in a row; impacts are outliers
-    (Geman-McClure). The residuals are changes of spin (rad/s) and of velocity (m/s), camera axes."""
+    (Cauchy). The residuals are changes of spin (rad/s) and of velocity (m/s), camera axes."""
     index = np.flatnonzero(use)
+    _add_still(H, g, poses, index, place, motion, config)
     for a, b, c in zip(index, index[1:], index[2:]):
-        if motion.toss[a] != motion.toss[c]:
+        if motion.toss[a] != motion.toss[c] or motion.still[b] or motion.still[c]:
             continue
         residual, jacobians = motion_residual((poses[a], poses[b], poses[c]), motion.times_s[[a, b, c]], motion)
         spin, speed = residual[:3] / config.spin_change_rad_s, residual[3:] / config.velocity_change_m_s
-        w_spin = 1.0 / (1.0 + spin @ spin / 4.0) ** 2 / config.spin_change_rad_s**2
-        w_speed = 1.0 / (1.0 + speed @ speed / 4.0) ** 2 / config.velocity_change_m_s**2
+        w_spin = 1.0 / (1.0 + spin @ spin / 4.0) / config.spin_change_rad_s**2
+        w_speed = 1.0 / (1.0 + speed @ speed / 4.0) / config.velocity_change_m_s**2
         w = np.array([w_spin] * 3 + [w_speed] * 3)
         for x, jx in zip((a, b, c), jacobians):
             if place[x] < 0:
@@ -172,6 +180,28 @@ def _add_motion(
             for y, jy in zip((a, b, c), jacobians):
                 if place[y] >= 0:
                     H[place[x], place[y]] += jx.T @ (w[:, None] * jy)
+
+
+def _add_still(
+    H: Float[Array, "f f 6 6"], g: Float[Array, "f 6"], poses: Float[Array, "n 4 4"], index: Int[Array, " m"],
+    place: Int[Array, " n"], motion: Motion, config: GraphConfig,
+) -> None:  # fmt: skip
+    """Ties poses between which the object stands still; robustly (Cauchy), because a slow start looks still."""
+    information = np.array([config.still_m**-2] * 3 + [config.still_rad**-2] * 3)
+    for a, b in zip(index, index[1:]):
+        if motion.toss[a] != motion.toss[b] or not motion.still[b]:
+            continue
+        gap = k.inverse(poses[a]) @ poses[b]  # = exp(twist of a) exp(-twist of b) near the solution
+        residual = np.concatenate([gap[:3, 3], rotation_log(gap[:3, :3])])
+        w = information / (1.0 + residual @ (information * residual) / 9.0)
+        for x, sign in ((a, 1.0), (b, -1.0)):
+            if place[x] < 0:
+                continue
+            g[place[x]] += sign * w * residual
+            H[place[x], place[x]] += np.diag(w)
+        if place[a] >= 0 and place[b] >= 0:
+            H[place[a], place[b]] -= np.diag(w)
+            H[place[b], place[a]] -= np.diag(w)
 
 
 def motion_residual(

@@ -1,7 +1,7 @@
 """Compiled kernels of the tracker: smooth depth and normals of a view, and the residuals of one view against another.
 
-A view is a crop of the rectified (pinhole) image with CHANNELS values a pixel, stored in one flat array for all views of
-a toss, and a few hundred sampled surface points. `table` says where each view's pixels and samples lie. Poses are
+A view is a crop of the rectified (pinhole) image with CHANNELS values a pixel, stored in one flat array for all views
+of a toss, and a few hundred sampled surface points. `table` says where each view's pixels and samples lie. Poses are
 4x4 `camera_from_object`; corrections are twists (translation, rotation) of the object frame, applied on its left:
 object_from_camera <- exp(twist) object_from_camera.
 """
@@ -19,7 +19,7 @@ LOOKS = 3
 SHARP, SMOOTH, CHANNELS = 5, 5 + LOOKS, 5 + 2 * LOOKS
 """First channel of the sharp looks and of the smooth ones; channels in all."""
 HIDDEN = -1.0
-"""OUTSIDE holds the distance to the mask in pixels (0 inside), or HIDDEN where something nearer may cover the object."""
+"""OUTSIDE holds the distance to the mask in pixels (0 inside), or HIDDEN where something nearer may be in the way."""
 
 OFFSET, U0, V0, WIDTH, HEIGHT, FIRST, COUNT = range(7)
 """Columns of the view table: first pixel, crop corner and size, first sample and number of samples."""
@@ -31,6 +31,8 @@ SAMPLE = 6 + 2 * LOOKS
 LEVEL, STEPS, GEOMETRY_M, INTENSITY, OUTLINE_M, SHARE = range(6)
 """Columns of a schedule row: intensity channel (0 sharp, 1 smooth), steps, the three scales, share of the samples."""
 
+LEAST_SLOPE = 0.03
+"""Looks that change by less a pixel are shading, which stays with the room: they pull little."""
 COVERED_COST = 0.12
 """Of a point that faces the other view but lies behind what is seen there: it may be covered."""
 ODD_COST = 0.4
@@ -39,7 +41,7 @@ ODD_COST = 0.4
 
 @no_type_check
 @njit(cache=True, nogil=True, fastmath=True)
-def fit_surface(depth_m, inside, rays, radius, edge_share, out_m, normals):
+def fit_surface(depth_m, inside, rays, radius, edge_share, out_m, normals):  # noqa: C901 (one hot loop)
     """Local planes, fitted to inverse depth (in which planes stay planes) over a window, twice: the second time
     without what lies off the first plane. Fills small holes. Writes depth and normal, 0 where there is no plane."""
     h, w = depth_m.shape
@@ -124,7 +126,7 @@ def fit_surface(depth_m, inside, rays, radius, edge_share, out_m, normals):
 
 @no_type_check
 @njit(cache=True, nogil=True, fastmath=True)
-def pair_terms(samples, step, pose, maps, row, focal, center, level, s_geo, s_int, s_out, H, g):
+def pair_terms(samples, step, pose, maps, row, focal, center, level, s_geo, s_int, s_out, H, g):  # noqa: C901
     """Adds normal equations of `samples` (of one camera) seen by another view, in that view's camera frame.
 
     pose: 4x4 other_from_sample_camera. H (6, 6), g (6): J^T W J and J^T W r for a twist (translation, rotation) of the
@@ -229,9 +231,12 @@ def pair_terms(samples, step, pose, maps, row, focal, center, level, s_geo, s_in
                 r = e / s_int
                 cost += 0.5 / LOOKS * min(r * r / 9.0, 1.0)
                 if abs(r) < 3.0:
-                    k = 1.0 - r * r / 9.0
-                    gu = ((i10 - i00) * (1 - b) + (i11 - i01) * b) * fx * iz
-                    gv = (bottom - top) * fy * iz
+                    gu = (i10 - i00) * (1 - b) + (i11 - i01) * b
+                    gv = bottom - top
+                    slope = gu * gu + gv * gv
+                    k = (1.0 - r * r / 9.0) * slope / (slope + LEAST_SLOPE * LEAST_SLOPE)
+                    gu *= fx * iz
+                    gv *= fy * iz
                     J[0], J[1] = gu, gv
                     J[2] = -(gu * x + gv * y) * iz
                     _add(J, x, y, z, e, wi * k * k, H, g)
@@ -390,8 +395,8 @@ def _pull(pose, wanted, information, H, g):
 @no_type_check
 @njit(cache=True, nogil=True)
 def graph_terms(poses, pairs, maps, samples, table, focal, center, row, blocks, gradients, figures):
-    """Normal equations of each pair (i, k): points of view i in view k. blocks (m, 6, 6), gradients (m, 6) for the twist
-    of i; that of k has the opposite sign. figures (m, 3): mean cost, share on the surface, share of violations."""
+    """Normal equations of each pair (i, k): points of view i in view k. blocks (m, 6, 6), gradients (m, 6) for the
+    twist of i; that of k has the opposite sign. figures (m, 3): mean cost, share on the surface, share of violations."""
     level = int(row[LEVEL])
     step = max(1, int(np.round(1.0 / row[SHARE])))
     h6, g6 = np.empty((6, 6)), np.empty(6)

@@ -33,6 +33,21 @@ def turn_between(after: Float[Array, "4 4"], before: Float[Array, "4 4"]) -> Flo
     return rotation_log(after[:3, :3] @ before[:3, :3].T)
 
 
+def steady_spin(
+    poses: Float[Array, "n 4 4"], times_s: Float[Array, " n"], limit_rad_s: float = 1.2, most: int = 5
+) -> Float[Array, "3"]:
+    """Spin (camera axes, rad/s) over the last poses, as far back as it was steady: a slow error of the poses must not
+    become the next prediction's truth. Poses in the order of tracking, at least two."""
+    spins = [turn_between(poses[-1 - j], poses[-2 - j]) / (times_s[-1 - j] - times_s[-2 - j])
+             for j in range(min(most, len(poses) - 1))]  # fmt: skip
+    used = [spins[0]]
+    for spin in spins[1:]:
+        if np.linalg.norm(spin - np.mean(used, axis=0)) > limit_rad_s:
+            break
+        used.append(spin)
+    return np.asarray(np.mean(used, axis=0))
+
+
 def moved(
     before: Float[Array, "4 4"],
     now: Float[Array, "4 4"],
@@ -40,11 +55,15 @@ def moved(
     next_s: float,
     center_m: Float[Array, "3"],
     gravity_camera_m_s2: Float[Array, "3"],
+    spin_rad_s: Float[Array, "3"] | None = None,
 ) -> Float[Array, "4 4"]:
-    """The pose `next_s` after `now`, `before` being `step_s` earlier: constant spin, ballistic centre (object frame)."""
+    """The pose `next_s` after `now`, `before` being `step_s` earlier: constant spin, ballistic centre.
+
+    `center_m` is that of mass in the object frame; `spin_rad_s` (camera axes) replaces the spin between the two."""
     ratio = next_s / step_s
     out = np.eye(4)
-    out[:3, :3] = rotation_exp(turn_between(now, before) * ratio) @ now[:3, :3]
+    turn = turn_between(now, before) * ratio if spin_rad_s is None else spin_rad_s * next_s
+    out[:3, :3] = rotation_exp(turn) @ now[:3, :3]
     x0, x1 = (p[:3, :3] @ center_m + p[:3, 3] for p in (before, now))
     center = x1 + (x1 - x0) * ratio + gravity_camera_m_s2 * (0.5 * next_s * (step_s + next_s))
     out[:3, 3] = center - out[:3, :3] @ center_m

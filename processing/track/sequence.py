@@ -27,7 +27,7 @@ from recordings.tracks import ObjectTrack, Status
 
 @dataclass(frozen=True)
 class TrackConfig:
-    """All settings of the tracker. Chosen on simulated variety (see tools/bench_vision.py), the same for every session."""
+    """All settings of the tracker, the same for every session; chosen on simulated variety."""
 
     view: ViewConfig = field(default_factory=ViewConfig)
     beam: BeamConfig = field(default_factory=BeamConfig)
@@ -93,7 +93,7 @@ def track_toss(
     if first is None:
         raise BadInput(
             f"toss {toss}: no frame shows the object: every mask is empty or has no depth; wanted at least "
-            f"{config.view.least_samples} mask pixels with depth: look at the masks with `toss-view`, or give a first mask"
+            f"{config.view.least_samples} mask pixels with depth: look at the masks with `toss-view`, give a first mask"
         )
     pose = first_pose(store, first) if start is None else start.matrix
     world = None if world_from_camera is None else world_from_camera.matrix
@@ -175,12 +175,13 @@ def _refined(
     fixed = np.zeros(n, dtype=bool)
     fixed[first] = True
     poses, center_m = best.poses, scene.center_m
+    still = np.array([i > 0 and use[i] and use[i - 1] and scene.store.stands_still(i - 1, i) for i in range(n)])
     delayed = any(c is not None and abs(c.depth_delay_s) > LEAST_DELAY_S for c in scene.store.crops)
     for _ in range(2 if delayed else 1):
         if delayed:
             use &= put_at_color_times(scene, poses, use)
         center_m = center_of_mass(poses, use, scene)
-        motion = Motion(scene.times_s, np.zeros(n, dtype=np.int64), scene.gravity_camera_m_s2, center_m)
+        motion = Motion(scene.times_s, np.zeros(n, dtype=np.int64), scene.gravity_camera_m_s2, center_m, still)
         joint = refine(scene.store, poses, use, fixed, motion, config.graph)
         poses = joint.poses
     cost, on = _per_view(joint.pairs, joint.figures, n)
@@ -194,7 +195,7 @@ def _refined(
 
 
 def put_at_color_times(scene: Scene, poses: Float[Array, "n 4 4"], use: Bool[Array, " n"]) -> Bool[Array, " n"]:
-    """Make every view again with the motion between its two exposures, from the neighbouring poses. Which are usable."""
+    """Make every view again with the motion between its two exposures, by neighbouring poses. Which are usable."""
     index = np.flatnonzero(use)
     out = use.copy()
     for a, i in enumerate(index):
@@ -214,7 +215,9 @@ def put_at_color_times(scene: Scene, poses: Float[Array, "n 4 4"], use: Bool[Arr
 def center_of_mass(poses: Float[Array, "n 4 4"], use: Bool[Array, " n"], scene: Scene) -> Float[Array, "3"]:
     """From the longest run of views whose motion is that of free flight."""
     index = np.flatnonzero(use)
-    motion = Motion(scene.times_s, np.zeros(len(poses), dtype=np.int64), scene.gravity_camera_m_s2, scene.center_m)
+    motion = Motion(
+        scene.times_s, np.zeros(len(poses), dtype=np.int64), scene.gravity_camera_m_s2, scene.center_m, ~use
+    )
     fly = -scene.gravity_camera_m_s2
     free = []
     for a, b, c in zip(index, index[1:], index[2:]):

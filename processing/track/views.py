@@ -274,6 +274,22 @@ def _samples(
     return np.concatenate([points, seen[:, k.NX : k.NZ + 1], seen[:, k.SHARP :]], -1).astype(np.float32)
 
 
+STILL_OUTLINE, STILL_PX, STILL_BRIGHTNESS = 0.96, 0.3, 0.03
+"""Overlap of outlines, shift of their middle and change of brightness of an object that stands still."""
+
+
+def _on_common_ground(one: Crop, two: Crop) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+    """Mask and brightness of two crops over the pixels that both cover."""
+    left, top = np.maximum(one.corner, two.corner)
+    ends = [np.add(c.corner, c.mask.shape[::-1]) for c in (one, two)]
+    right, bottom = np.minimum(*ends)
+    out = []
+    for c in (one, two):
+        area = np.s_[top - c.corner[1] : bottom - c.corner[1], left - c.corner[0] : right - c.corner[0]]
+        out.append((c.mask[area], c.color[area].mean(-1)))
+    return out[0], out[1]
+
+
 class ViewStore:
     """The views of one or several tosses in the flat arrays that the kernels read."""
 
@@ -309,6 +325,32 @@ class ViewStore:
         self.center_m[i] = view.center_m
         self.motion[i] = motion
         return True
+
+    def stands_still(self, i: int, j: int) -> bool:
+        """Whether the object has not moved between two frames, as far as its outline and brightness tell."""
+        one, two = self.crops[i], self.crops[j]
+        if one is None or two is None or max(np.abs(np.subtract(one.corner, two.corner))) > 3:
+            return False
+        a, b = _on_common_ground(one, two)
+        both, either = int((a[0] & b[0]).sum()), int((a[0] | b[0]).sum())
+        if both < STILL_OUTLINE * either:
+            return False
+        move_px = np.abs(np.mean(np.nonzero(a[0]), axis=1) - np.mean(np.nonzero(b[0]), axis=1)).max()
+        change = np.median(np.abs(a[1] - b[1])[a[0] & b[0]])
+        return bool(move_px < STILL_PX and change < STILL_BRIGHTNESS)
+
+    def only(self, views: Int64[Array, " m"]) -> ViewStore:
+        """The same store with some of its views alone (pixels copied)."""
+        out = ViewStore(self.optics, [self.crops[int(i)] for i in views], self.config)
+        for new, i in enumerate(views):
+            crop, row = out.crops[new], self.table[i]
+            size = 0 if crop is None else crop.mask.size
+            offset, first, n = int(out.table[new, k.OFFSET]), int(out.table[new, k.FIRST]), int(row[k.COUNT])
+            out.maps[offset : offset + size] = self.maps[row[k.OFFSET] : row[k.OFFSET] + size]
+            out.samples[first : first + n] = self.samples[row[k.FIRST] : row[k.FIRST] + n]
+            out.table[new, k.U0 : k.HEIGHT + 1], out.table[new, k.COUNT] = row[k.U0 : k.HEIGHT + 1], n
+            out.center_m[new], out.motion[new] = self.center_m[i], self.motion[int(i)]
+        return out
 
     @staticmethod
     def joined(stores: list[ViewStore]) -> ViewStore:
