@@ -10,13 +10,15 @@ from pathlib import Path
 from mcap.records import Attachment, Metadata
 
 from recordings.documents import FORMAT_VERSION, as_dict, json_object
-from recordings.errors import BadInput, DamagedFile, WriteFailed
+from recordings.errors import BadInput, DamagedFile, TosslabError, WriteFailed
 from recordings.mcap_scan import Bytes
 from recordings.mcap_writer import LATEST_NS, MAGIC, McapWriter
 from recordings.salvage import SavedMessage, Survey, saved, survey
+from recordings.tracks import RigCalibration
 
 STOP = "tosslab.stop"
 REPORT = "tosslab.recovered"
+CALIBRATION = "calibration.json"
 
 
 @dataclass(frozen=True)
@@ -83,17 +85,21 @@ class _Rewriting:
         self.numbers: dict[str, list[int]] = {}
         self.undefined: dict[int, int] = {}
         self.impossible = 0
+        self.attached: set[str] = set()
+        self.mended: list[str] = []
         self.metadata: dict[str, dict[str, str]] = {}
 
     def run(self) -> Recovered:
         for item in saved(self.file, self.found):
             if isinstance(item, Attachment):
+                self.attached.add(item.name)
                 self.writer.attachment(item.name, item.media_type, item.data, item.log_time)
             elif isinstance(item, Metadata):
                 self._metadata(item)
             else:
                 self._message(item)
         self._own_metadata()
+        self._calibration_from_beside()
         report = self._report()
         self._say(report)
         sha256 = self.writer.finish()
@@ -115,6 +121,19 @@ class _Rewriting:
         info = {"toss": int(number)} if number.isdigit() else {}
         kind = "calibration" if stem == "calibration" else "toss"
         self.writer.metadata("tosslab", {"format_version": str(FORMAT_VERSION), "kind": kind, "info": json.dumps(info)})
+
+    def _calibration_from_beside(self) -> None:
+        """The session's own calibration.json, where the file's copy was lost and that one is whole."""
+        beside = self.source.parent / CALIBRATION
+        if CALIBRATION in self.attached or "tosslab" not in self.metadata or not beside.is_file():
+            return
+        try:
+            RigCalibration.read(beside)
+            data = beside.read_bytes()
+        except (TosslabError, OSError):
+            return
+        self.writer.attachment(CALIBRATION, "application/json", data)
+        self.mended.append(f"its {CALIBRATION} was lost; the session's, which lies beside it, was taken")
 
     def _message(self, item: SavedMessage) -> None:
         if item.channel not in self.channels:
@@ -151,7 +170,8 @@ class _Rewriting:
 
     def _report(self) -> Recovered:
         damage = tuple(f"bytes {a} to {b}: {what}" for a, b, what in self.found.damage)
-        notes = [f"{n} messages of channel {c}, whose definition is lost" for c, n in self.undefined.items()]
+        notes = list(self.mended)
+        notes += [f"{n} messages of channel {c}, whose definition is lost" for c, n in self.undefined.items()]
         notes += [f"{self.impossible} messages with impossible times"] if self.impossible else []
         if self.found.damage and not self.found.stated:
             notes.append(

@@ -119,6 +119,21 @@ def test_our_own_record_is_made_anew_when_just_that_was_lost(write_session, tmp_
         assert session.tosses == (2,)
 
 
+def test_a_lost_calibration_is_taken_from_the_session_beside(write_session, tmp_path):
+    folder = write_session()
+    path = folder / "toss_00.mcap"
+    path.write_bytes(path.read_bytes().replace(b'"transforms"', b'"transformz"', 1))
+    report = recover_file(path, tmp_path / "a.mcap")
+    assert any("calibration.json' differs from its CRC" in text for text in report.damage)
+    assert any("which lies beside it, was taken" in note for note in report.notes)
+    with Session.open(tmp_path / "a.mcap") as session:
+        assert session.calibration.camera("d455").width == 64
+    (folder / "calibration.json").unlink()
+    recover_file(path, tmp_path / "b.mcap")
+    with Session.open(tmp_path / "b.mcap") as session:
+        assert session.calibration.cameras == {}
+
+
 def test_two_recordings_in_one_file_are_not_mixed_up(tmp_path):
     for name, topic in (("a.mcap", "/a"), ("b.mcap", "/b")):
         with McapWriter(tmp_path / name) as writer:
