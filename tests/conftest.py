@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+import resource
+from collections.abc import Callable, Generator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -19,6 +20,16 @@ DATA = Path(os.environ.get("TOSSLAB_DATA", ROOT.parent / "shared" / "data"))
 # No deadlines: the machine is shared. In CI the same examples every time.
 settings.register_profile("tosslab", deadline=None, derandomize="CI" in os.environ)
 settings.load_profile("tosslab")
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call() -> Generator[None, object, object]:
+    """A test that plays a full disk limits the size of every file of this process: pytest's own log must not meet that."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    try:
+        return (yield)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 @pytest.fixture(scope="session")
