@@ -24,7 +24,7 @@ settings.load_profile("tosslab")
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_call() -> Generator[None, object, object]:
-    """A test that plays a full disk limits the size of every file of this process: pytest's own log must not meet that."""
+    """A test that plays a full disk limits the size of this process's files: pytest's own log must not meet that."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     try:
         return (yield)
