@@ -162,10 +162,15 @@ def _put_at_color_time(scene: Scene, h: Hypothesis, i: int) -> None:
     crop, tracked = scene.store.crops[i], [j for j in h.tracked if j != i]
     if crop is None or abs(crop.depth_delay_s) < LEAST_DELAY_S or len(tracked) < 2 or np.isfinite(h.poses[i, 0, 0]):
         return
-    a, b = tracked[-2], tracked[-1]
+    if scene.store.stands_still(tracked[-1], i):
+        return
+    # over three poses, not two: an error of the last pose must not move the depth that the next one rests on
+    a, b = tracked[max(-3, -len(tracked))], tracked[-1]
     step_s = scene.times_s[b] - scene.times_s[a]
+    recent = list(tracked[-6:])
+    spin = steady_spin(h.poses[recent], scene.times_s[recent])
     color, depth = (
-        moved(h.poses[a], h.poses[b], step_s, t - scene.times_s[b], scene.center_m, scene.gravity_camera_m_s2)
+        moved(h.poses[a], h.poses[b], step_s, t - scene.times_s[b], scene.center_m, scene.gravity_camera_m_s2, spin)
         for t in (scene.times_s[i], scene.times_s[i] + crop.depth_delay_s)
     )
     scene.store.fill(i, color @ k.inverse(depth))
@@ -285,8 +290,8 @@ def _searched(
             turned[:3, :3] = turn @ pose[:3, :3]
             turned[:3, 3] = middle - turned[:3, :3] @ scene.center_m
             tries.append(turned)
-    rough = [_aligned(scene, h, i, t, config.grid, config, "grid") for t in tries]
-    rough = _merged([c for c in rough if c is not None], config)[:8]
+    tried = [_aligned(scene, h, i, t, config.grid, config, "grid") for t in tries]
+    rough = _merged([c for c in tried if c is not None], config)[:8]
     return _refined(scene, h, i, rough, config)
 
 
@@ -338,9 +343,10 @@ def _aligned(
         return None
     store = scene.store
     distance = float(np.linalg.norm(store.center_m[i]))
+    pull, wanted = (np.zeros(6), np.eye(4)) if held is None else (_hold(config), held)
     aligned, _, fit, on, _ = k.align_view(
-        np.ascontiguousarray(pose), i, refs, np.ascontiguousarray(h.poses[refs]), store.maps, store.samples, store.table,
-        store.optics.focal, store.optics.center, rows(schedule, distance), np.zeros(6) if held is None else _hold(config), np.eye(4) if held is None else held,
+        np.ascontiguousarray(pose), i, refs, np.ascontiguousarray(h.poses[refs]), store.maps, store.samples,
+        store.table, store.optics.focal, store.optics.center, rows(schedule, distance), pull, wanted,
     )  # fmt: skip
     if not np.isfinite(aligned).all():
         return None

@@ -38,7 +38,7 @@ class GraphConfig:
         (0, 3, 0.003, 0.15, 0.005, 1.0),
         (0, 5, 0.0035, 0.08, 0.005, 1.0),
     )
-    """The last row weighs looks more: their errors are a tenth of a pixel, those of depth are shared by whole patches."""
+    """The last row weighs looks more: they err by a tenth of a pixel, and whole patches of depth err together."""
     sure_cost: float = 0.08
     """A pair that fits worse counts less."""
     spin_change_rad_s: float = 0.7

@@ -395,8 +395,10 @@ def _pull(pose, wanted, information, H, g):
 @no_type_check
 @njit(cache=True, nogil=True)
 def graph_terms(poses, pairs, maps, samples, table, focal, center, row, blocks, gradients, figures):
-    """Normal equations of each pair (i, k): points of view i in view k. blocks (m, 6, 6), gradients (m, 6) for the
-    twist of i; that of k has the opposite sign. figures (m, 3): mean cost, share on the surface, share of violations."""
+    """Normal equations of each pair (i, k): points of view i in view k.
+
+    blocks (m, 6, 6), gradients (m, 6) for the twist of i; that of k has the opposite sign. figures (m, 3): mean cost,
+    share on the surface, share of violations."""
     level = int(row[LEVEL])
     step = max(1, int(np.round(1.0 / row[SHARE])))
     h6, g6 = np.empty((6, 6)), np.empty(6)

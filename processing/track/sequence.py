@@ -24,6 +24,9 @@ from recordings.progress import Progress, Silent
 from recordings.records import RgbdFrame
 from recordings.tracks import ObjectTrack, Status
 
+IMPACT_M_S = 0.35
+"""A change of velocity around a frame beyond this is an impact."""
+
 
 @dataclass(frozen=True)
 class TrackConfig:
@@ -202,13 +205,40 @@ def put_at_color_times(scene: Scene, poses: Float[Array, "n 4 4"], use: Bool[Arr
         crop = scene.store.crops[i]
         if crop is None or abs(crop.depth_delay_s) < LEAST_DELAY_S or len(index) < 2:
             continue
-        later = crop.depth_delay_s > 0
-        j = index[min(a + 1, len(index) - 1)] if later else index[max(a - 1, 0)]
-        if j == i:
-            continue
-        share = crop.depth_delay_s / (scene.times_s[j] - scene.times_s[i])
-        at_depth = between(poses[i], poses[j], float(np.clip(share, 0, 1)), scene.center_m)
+        at_depth = _at_depth_time(scene, poses, index, a, crop.depth_delay_s)
         out[i] = scene.store.fill(int(i), poses[i] @ k.inverse(at_depth))
+    return out
+
+
+def _at_depth_time(
+    scene: Scene, poses: Float[Array, "n 4 4"], index: Int[Array, " m"], a: int, delay_s: float
+) -> Float[Array, "4 4"]:
+    """Pose at depth's exposure of the view index[a]. The motion is that over both neighbours, because errors of single
+    poses would move the depth that they rest on; only an impact's jump is taken from the nearer side."""
+    i, t = index[a], scene.times_s
+    before, after = index[max(a - 1, 0)], index[min(a + 1, len(index) - 1)]
+    side = (i, after) if delay_s > 0 else (before, i)
+    if side[0] == side[1] or scene.store.stands_still(int(side[0]), int(side[1])):
+        return poses[i]
+    speeds = []
+    for x, y in ((before, after), side):
+        centers = [poses[z][:3, :3] @ scene.center_m + poses[z][:3, 3] for z in (x, y)]
+        speeds.append((centers[1] - centers[0]) / (t[y] - t[x]))
+    x, y = side if np.linalg.norm(speeds[0] - speeds[1]) > IMPACT_M_S else (before, after)
+    share = delay_s / (t[y] - t[x])
+    step = between(poses[x], poses[y], abs(float(share)), scene.center_m) @ k.inverse(poses[x])  # camera axes
+    return _carried(poses[i], step if share > 0 else k.inverse(step), poses[x], poses[y], float(share), scene.center_m)
+
+
+def _carried(
+    pose: Float[Array, "4 4"], turn: Float[Array, "4 4"], start: Float[Array, "4 4"], end: Float[Array, "4 4"],
+    share: float, center_m: Float[Array, "3"],
+) -> Float[Array, "4 4"]:  # fmt: skip
+    """`pose` turned as `turn` turns, its middle moved by `share` of the way from `start`'s to `end`'s."""
+    out = np.eye(4)
+    out[:3, :3] = turn[:3, :3] @ pose[:3, :3]
+    way = (end[:3, :3] @ center_m + end[:3, 3]) - (start[:3, :3] @ center_m + start[:3, 3])
+    out[:3, 3] = pose[:3, :3] @ center_m + pose[:3, 3] + share * way - out[:3, :3] @ center_m
     return out
 
 
