@@ -319,7 +319,8 @@ def _open_folder(path: Path) -> Session:
     document_path = path / "session.json"
     if not files and list(path.glob("toss_*/rgb")):
         raise BadInput(
-            f"{path} is a folder layout, not yet a session; bring it in: `toss-session import folder {path} NEW_SESSION`"
+            f"{path} is a folder layout, not yet a session; bring it in: "
+            f"`toss-session import folder {path} NEW_SESSION`"
         )
     if not document_path.exists():
         raise BadInput(f"{path} has no session.json, so it is no session")
