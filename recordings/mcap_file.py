@@ -139,12 +139,10 @@ class McapFile:
     def publish_times_ns(self, topic: str) -> Int64[Array, " n"]:
         """Publish time of every message of a topic; of uncompressed chunks only the message heads are read."""
         index = self.topic_index(topic)
-        times = np.empty(len(index), dtype=np.int64)
-        for i in range(len(index)):
-            times[i] = self._guard(
-                partial(self._publish_time, int(index.chunk[i]), int(index.offset[i])), f"message {i} of {topic}"
-            )
-        return times
+        places = zip(index.chunk.tolist(), index.offset.tolist(), strict=True)
+        return self._guard(
+            lambda: np.array([self._publish_time(c, o) for c, o in places], dtype=np.int64), f"the times of {topic}"
+        )
 
     def metadata(self, name: str) -> list[dict[str, str]]:
         """Every metadata record of that name."""
