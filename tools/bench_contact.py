@@ -16,15 +16,15 @@ from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-import numpy as np  # noqa: E402
-import torch  # noqa: E402
+import numpy as np
+import torch
 
-from processing.contact.evaluate import evaluate  # noqa: E402
-from processing.contact.inertia import Physics, known_physics, uniform_physics  # noqa: E402
-from processing.contact.learn import ContactConfig, ContactLearning, Plane, learn_contact  # noqa: E402
-from processing.contact.motion import PoseSeries, rotation_matrices  # noqa: E402
-from processing.contact.prior import Prior, prior_from_shape, prior_from_size  # noqa: E402
-from recordings.tracks import ObjectShape  # noqa: E402
+from processing.contact.evaluate import evaluate
+from processing.contact.inertia import Physics, known_physics, uniform_physics
+from processing.contact.learn import ContactConfig, ContactLearning, Plane, learn_contact
+from processing.contact.motion import PoseSeries, rotation_matrices
+from processing.contact.prior import Prior, prior_from_shape, prior_from_size
+from recordings.tracks import ObjectShape
 
 ROOT = Path(__file__).resolve().parent.parent
 TOSSES = Path(os.environ.get("TOSSLAB_DATA", ROOT.parent / "shared" / "data")) / "contactnets" / "tosses_processed"
@@ -91,7 +91,8 @@ def box(count: int) -> None:
     f = learning.friction
     line(
         f"box, {count} tosses",
-        f"{mm:.2f} mm / {deg:.2f} deg; true cube {true_mm:.2f} / {true_deg:.2f}; ratio {mm / true_mm:.3f} / {deg / true_deg:.3f}; "
+        f"{mm:.2f} mm / {deg:.2f} deg; true cube {true_mm:.2f} / {true_deg:.2f}; ratio {mm / true_mm:.3f} / "
+        f"{deg / true_deg:.3f}; "
         f"friction {f.value:.3f} ({f.low:.3f} .. {f.high:.3f}); edges {np.round(edges, 2)} mean {np.mean(edges):.2f}; "
         f"fit {learning.cpu_seconds:.2f} CPU-s, all {total:.1f} + imports; weight {learning.weights.dissipation:g}; "
         f"unsolved {learning.solver_failures}; unexplained {sum(map(len, learning.unexplained.values()))}",
@@ -99,7 +100,8 @@ def box(count: int) -> None:
 
 
 def hull(count: int = 16) -> None:
-    """From a sphere, with the plane as calibrated by the data's own resting height (-1.2 mm) and with the plane at 0."""
+    """From a sphere, with the plane as calibrated by the data's own resting height (-1.2 mm) and with the plane at
+    0."""
     import trimesh
 
     tests, tracks = test_tosses(), [toss(n) for n in there(range(count))]
@@ -113,7 +115,8 @@ def hull(count: int = 16) -> None:
         line(
             f"hull, {count}, plane {offset * 1e3:.1f} mm",
             f"Chamfer {1e3 * chamfer_m(learning.shape, cube):.2f} mm; friction {learning.friction.value:.3f}; "
-            f"{1e3 * done.position.mean:.2f} mm / {np.degrees(done.rotation.mean):.2f} deg; fit {learning.cpu_seconds:.1f} CPU-s, "
+            f"{1e3 * done.position.mean:.2f} mm / {np.degrees(done.rotation.mean):.2f} deg; fit "
+            f"{learning.cpu_seconds:.1f} CPU-s, "
             f"all {total:.1f}; weight {learning.weights.dissipation:g}; untouched {len(learning.untouched_vertices)}",
         )
 
@@ -145,7 +148,8 @@ def noise() -> None:
             f = learning.friction
             line(
                 f"30 Hz, {mm_noise:g} mm {deg_noise:g} deg",
-                f"tosses {picked[0]}..{picked[-1]}: {mm:.2f} mm / {deg:.2f} deg; friction {f.value:.3f} ({f.low:.3f} .. "
+                f"tosses {picked[0]}..{picked[-1]}: {mm:.2f} mm / {deg:.2f} deg; friction {f.value:.3f} ({f.low:.3f} "
+                ".. "
                 f"{f.high:.3f}); edges {np.round([1e3 * e.value for e in learning.extents], 1)}; all "
                 f"{time.process_time() - began:.1f} CPU-s; weight {learning.weights.dissipation:g}",
             )
@@ -154,7 +158,7 @@ def noise() -> None:
 def one() -> None:
     """50 single tosses: how often the intervals hold friction .18 and the size that the data have (102.4 mm)."""
     friction, size, each, widths = [], [], [], []
-    picked = there([n for n in range(160, 400)])[:50]
+    picked = there(range(160, 400))[:50]
     for n in picked:
         learning = learn_contact([toss(n)], prior_from_size("box", 0.05), CUBE)
         f = learning.friction
@@ -166,8 +170,10 @@ def one() -> None:
     w = np.array(widths)
     line(
         "one toss",
-        f"{len(picked)} tosses: friction inside {100 * np.mean(friction):.0f} %, all edges inside {100 * np.mean(size):.0f} %, "
-        f"each edge {100 * np.mean(each):.0f} %; median half widths {np.median(w[:, 1]):.3f}, {np.median(w[:, 2:]):.2f} mm; "
+        f"{len(picked)} tosses: friction inside {100 * np.mean(friction):.0f} %, all edges inside "
+        f"{100 * np.mean(size):.0f} %, "
+        f"each edge {100 * np.mean(each):.0f} %; median half widths {np.median(w[:, 1]):.3f}, "
+        f"{np.median(w[:, 2:]):.2f} mm; "
         f"friction {np.mean(w[:, 0]):.3f} +- {np.std(w[:, 0]):.3f}",
     )
 
@@ -182,8 +188,8 @@ def simulated(mesh_pieces: Sequence[object], physics: Physics, mu: float, count:
     body = spec.worldbody.add_body(name="object")
     body.add_freejoint()
     body.explicitinertial, body.mass, body.ipos = True, physics.mass_kg, physics.center_of_mass_m
-    I = physics.inertia_kgm2
-    body.fullinertia = [I[0, 0], I[1, 1], I[2, 2], I[0, 1], I[0, 2], I[1, 2]]
+    inertia = physics.inertia_kgm2
+    body.fullinertia = inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
     stiff = {"friction": [mu, 1e-5, 1e-6], "solref": [0.002, 1.0], "solimp": [0.95, 0.99, 0.0005, 0.5, 2], "condim": 3}
     spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[5, 5, 0.1], **stiff)
     for i, piece in enumerate(mesh_pieces):
@@ -231,9 +237,11 @@ def shapes() -> None:
         line(
             name,
             f"Chamfer {1e3 * chamfer_m(start, truth):.2f} -> {1e3 * chamfer_m(learning.shape, truth):.2f} mm; friction "
-            f"{learning.friction.value:.3f} ({learning.friction.low:.3f} .. {learning.friction.high:.3f}), true .250; rollouts "
+            f"{learning.friction.value:.3f} ({learning.friction.low:.3f} .. {learning.friction.high:.3f}), true "
+            ".250; rollouts "
             f"{1e3 * done.position.mean:.1f} mm / {np.degrees(done.rotation.mean):.1f} deg on 8 unseen; fit "
-            f"{learning.cpu_seconds:.1f} CPU-s; pieces {len(learning.model.pieces)}; weight {learning.weights.dissipation:g}; "
+            f"{learning.cpu_seconds:.1f} CPU-s; pieces {len(learning.model.pieces)}; weight "
+            f"{learning.weights.dissipation:g}; "
             f"untouched {len(learning.untouched_vertices)} of {len(learning.touched)}",
         )
 

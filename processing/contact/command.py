@@ -13,10 +13,7 @@ from recordings.errors import BadInput
 from recordings.progress import Progress, Silent
 
 if TYPE_CHECKING:
-    from processing.contact.inertia import Physics
-    from processing.contact.learn import ContactLearning, Plane
     from processing.contact.motion import PoseSeries
-    from processing.contact.prior import Prior
     from recordings.session import Session
     from recordings.tracks import ObjectShape
 
@@ -31,10 +28,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("contact-only")
     group.add_argument("--train", metavar="I-J", help="tosses to learn from (default: all but the last)")
     group.add_argument("--test", metavar="I-J", help="tosses to roll out (default: all, the last one marked)")
-    group.add_argument("--geometry", choices=("box", "hull", "nonconvex"), help="hull with a shape to start from, else box")
-    group.add_argument("--init", metavar="SIDE_M", type=float, help="start from a cube of this side (m), not from a shape")
-    group.add_argument("--poses", choices=("truth", "track"), help="the track (default) or, marked in the result, the truth")
-    group.add_argument("--steps", metavar="N", type=int, default=DEFAULT_STEPS, help="steps of 1/148 s to roll out (80)")
+    group.add_argument(
+        "--geometry", choices=("box", "hull", "nonconvex"), help="hull with a shape to start from, else box"
+    )
+    group.add_argument(
+        "--init", metavar="SIDE_M", type=float, help="start from a cube of this side (m), not from a shape"
+    )
+    group.add_argument(
+        "--poses", choices=("truth", "track"), help="the track (default) or, marked in the result, the truth"
+    )
+    group.add_argument(
+        "--steps", metavar="N", type=int, default=DEFAULT_STEPS, help="steps of 1/148 s to roll out (80)"
+    )
 
 
 def run(args: argparse.Namespace, session: Session, out_dir: Path, progress: Progress) -> Outcome:
@@ -88,7 +93,9 @@ def _split(there: Sequence[int], train: str | None, test: str | None) -> tuple[l
     """Tosses to learn from and to roll out. Without --train: all but the last (of --test, all that are not in it)."""
     if train is not None:
         learned = chosen(train, there, "--train")
-        tested = chosen(test, there, "--test") if test is not None else [t for t in there if t not in learned] or learned
+        tested = (
+            chosen(test, there, "--test") if test is not None else [t for t in there if t not in learned] or learned
+        )
         return learned, tested
     if test is not None:
         tested = chosen(test, there, "--test")
@@ -115,7 +122,8 @@ def _span(there: Sequence[int]) -> str:
 
 
 def find_poses(session: Session, out_dir: Path, poses: str | None, tosses: Sequence[int]) -> PoseSource:
-    """The tracks of some tosses: those of vision where the results folder holds them, else `/track/pose`, or the truth."""
+    """The tracks of some tosses: those of vision where the results folder holds them, else `/track/pose`, or the
+    truth."""
     from processing.contact.motion import PoseSeries
 
     if poses == "truth":
@@ -127,7 +135,8 @@ def find_poses(session: Session, out_dir: Path, poses: str | None, tosses: Seque
     empty = [t for t, p in found.items() if not p]
     if empty:
         raise BadInput(
-            f"toss {empty[0]} of {session.path} has no poses (no track in {out_dir}, nothing on /track/pose); wanted a tracked "
+            f"toss {empty[0]} of {session.path} has no poses (no track in {out_dir}, nothing on /track/pose); "
+            "wanted a tracked "
             "session: run `toss-process SESSION` first, or import poses with `toss-session import contactnets`"
         )
     return PoseSource("/track/pose", [PoseSeries.from_poses(t, p) for t, p in found.items()], None)

@@ -1,7 +1,8 @@
 """Does the data mean what it says? Step, scale, quaternion order, velocity frames, jumps, plane, duplicates.
 
 Every check is a physical law that the right reading fulfils: free fall accelerates at 9.81 m/s^2; velocities are
-differences of poses; an impulse at a point changes spin and velocity at right angles; a resting object touches the plane.
+differences of poses; an impulse at a point changes spin and velocity at right angles; a resting object touches the
+plane.
 """
 
 from __future__ import annotations
@@ -75,7 +76,8 @@ def check_fall(tosses: Sequence[PoseSeries]) -> float | None:
         raise BadInput(f"free fall accelerates upwards ({fall:.2f} m/s^2): z of `world` must point up, against gravity")
     step = tosses[0].step_s
     raise BadInput(
-        f"free fall reads {-fall:.2f} m/s^2 instead of 9.81: either the time step is wrong ({step * 1e3:.3f} ms is said, "
+        f"free fall reads {-fall:.2f} m/s^2 instead of 9.81: either the time step is wrong ({step * 1e3:.3f} "
+        "ms is said, "
         f"{step * 1e3 * (-fall / GRAVITY_M_S2) ** 0.5:.3f} ms would fit) or the scale (1 m in the data would be "
         f"{GRAVITY_M_S2 / -fall:.4f} m); import it again with the right `--dt` or `--scale`"
     )
@@ -94,7 +96,8 @@ READINGS = {
 
 
 def impact_angle(tosses: Sequence[PoseSeries], inertia: Float[Array, "3 3"]) -> tuple[float, int]:
-    """|dL . dv| / (|dL| |dv|) over impacts, weighted by the product, and how many impacts: near 0 where orientations are
+    """|dL . dv| / (|dL| |dv|) over impacts, weighted by the product, and how many impacts: near 0 where
+    orientations are
     read right, about 0.5 where they are not. An impulse J at r gives m dv = J and dL = r x J."""
     across = along = 0.0
     count = 0
@@ -112,7 +115,8 @@ def impact_angle(tosses: Sequence[PoseSeries], inertia: Float[Array, "3 3"]) -> 
 
 
 def check_orientations(tosses: Sequence[PoseSeries], inertia: Float[Array, "3 3"]) -> float:
-    """How far impacts are from a right angle (0..1). Raises BadInput where another reading of the rotations fits far better."""
+    """How far impacts are from a right angle (0..1). Raises BadInput where another reading of the rotations fits
+    far better."""
     here, count = impact_angle(tosses, inertia)
     if count < 5:
         return here
@@ -120,7 +124,8 @@ def check_orientations(tosses: Sequence[PoseSeries], inertia: Float[Array, "3 3"
         other, _ = impact_angle([read(s) for s in tosses], inertia)
         if here > 0.3 and other < 0.6 * here:
             raise BadInput(
-                f"impacts do not fit the orientations (misfit {here:.2f}), but they do ({other:.2f}) when the rotations are "
+                f"impacts do not fit the orientations (misfit {here:.2f}), but they do ({other:.2f}) when the "
+                "rotations are "
                 f"{name}; import the data again in that reading"
             )
     return here
@@ -141,12 +146,14 @@ def check_velocities(tosses: Sequence[PoseSeries]) -> None:
         best = min(others, key=lambda item: item[1])
         if right[1] > 0.25 * size and best[1] < 0.5 * right[1]:
             raise BadInput(
-                f"the claimed {what} is not the difference of the poses (off by {right[1]:.3g}, typical size {size:.3g}), "
+                f"the claimed {what} is not the difference of the poses (off by {right[1]:.3g}, typical size "
+                f"{size:.3g}), "
                 f"but it is ({best[1]:.3g}) read as {best[0]}; wanted: {right[0]}"
             )
         if right[1] > 0.25 * size:
             raise BadInput(
-                f"the claimed {what} is not the difference of the poses (off by {right[1]:.3g}, typical size {size:.3g}): "
+                f"the claimed {what} is not the difference of the poses (off by {right[1]:.3g}, typical size "
+                f"{size:.3g}): "
                 "check the time step"
             )
 
@@ -185,10 +192,9 @@ def _angular_gaps(tosses: Sequence[PoseSeries]) -> Gaps:
     }
 
 
-def lowest_point_m(
-    series: PoseSeries, points_m: Float[Array, "v 3"], phases: Phases
-) -> float | None:
-    """Height of the lowest point above the plane (z = 0), median over the rest at the end. None where it does not rest."""
+def lowest_point_m(series: PoseSeries, points_m: Float[Array, "v 3"], phases: Phases) -> float | None:
+    """Height of the lowest point above the plane (z = 0), median over the rest at the end. None where it does not
+    rest."""
     if phases.rest is None:
         return None
     rest = slice(phases.rest, None)
@@ -196,15 +202,18 @@ def lowest_point_m(
 
 
 def check_plane(heights_m: Mapping[int, float], what: str) -> float | None:
-    """The median height of the resting object's lowest point. Raises BadInput where it is more than 5 mm off the plane."""
+    """The median height of the resting object's lowest point. Raises BadInput where it is more than 5 mm off the
+    plane."""
     if not heights_m:
         return None
     height = float(np.median(list(heights_m.values())))
     if abs(height) > PLANE_TOLERANCE_M:
         side = "above" if height > 0 else "below"
         raise BadInput(
-            f"at rest the lowest point of {what} is {abs(height) * 1e3:.1f} mm {side} the plane (median of {len(heights_m)} "
-            f"tosses); wanted within {PLANE_TOLERANCE_M * 1e3:.0f} mm: calibrate the plane (`toss-calibrate table SESSION`) "
+            f"at rest the lowest point of {what} is {abs(height) * 1e3:.1f} mm {side} the plane (median of "
+            f"{len(heights_m)} "
+            f"tosses); wanted within {PLANE_TOLERANCE_M * 1e3:.0f} mm: calibrate the plane (`toss-calibrate table "
+            "SESSION`) "
             "or check the size of the shape"
         )
     return height
@@ -238,5 +247,6 @@ def refuse_leaks(train: Sequence[int], test: Sequence[int], groups: Sequence[Seq
         learned, tested = sorted(set(group) & set(train)), sorted(set(group) & set(test))
         if learned and tested:
             raise BadInput(
-                f"toss {tested[0]} of --test is the same recording as toss {learned[0]} of --train; leave one of them out"
+                f"toss {tested[0]} of --test is the same recording as toss {learned[0]} of --train; leave one of them "
+                "out"
             )

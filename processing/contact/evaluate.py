@@ -135,6 +135,4 @@ def evaluate_from(
         tracks = [moved[t.toss] for t in tracks]
         begin = [int(np.abs(t.time_s - at).argmin()) for t, at in zip(tracks, times)]
     errors = rollout_errors(rolled, tracks, begin, step_s)
-    return Evaluation(
-        errors, summarise(errors.position_m), summarise(errors.rotation_rad), dict(prepared.left_out)
-    )
+    return Evaluation(errors, summarise(errors.position_m), summarise(errors.rotation_rad), dict(prepared.left_out))

@@ -2,7 +2,8 @@
 
 Friction against a ground: simulators combine two coefficients in their own ways (MuJoCo takes the larger one unless a
 geom has priority, PyBullet multiplies, Drake takes 2ab/(a+b)). What was learned is the effective one, so the MJCF gives
-the object priority, the URDF wants a ground of 1.0 and the SDFormat a ground of the same coefficient; each file says so.
+the object priority, the URDF wants a ground of 1.0 and the SDFormat a ground of the same coefficient; each file
+says so.
 """
 
 from __future__ import annotations
@@ -39,7 +40,9 @@ def write_assets(folder: Path, model: ContactModel, shape: ObjectShape, name: st
 
 def _write_meshes(folder: Path, model: ContactModel, shape: ObjectShape, name: str) -> list[str]:
     """`<name>.obj` to look at, `<name>_piece<i>.obj` convex ones to touch with; returns the pieces' names."""
-    plain = ObjectShape(shape.object_frame, shape.source, shape.vertices_m, shape.faces)  # MuJoCo refuses vertex colours
+    plain = ObjectShape(
+        shape.object_frame, shape.source, shape.vertices_m, shape.faces
+    )  # MuJoCo refuses vertex colours
     (folder / f"{name}.obj").write_text(obj_text(plain))
     names = []
     for i, piece in enumerate(model.pieces):
@@ -60,9 +63,7 @@ def _inertia_attributes(inertia: Float[Array, "3 3"]) -> str:
 
 def urdf_text(model: ContactModel, name: str, meshes: list[str]) -> str:
     """URDF with one link. The `contact` element is PyBullet's."""
-    collisions = "".join(
-        f'    <collision><geometry><mesh filename="{m}"/></geometry></collision>\n' for m in meshes
-    )
+    collisions = "".join(f'    <collision><geometry><mesh filename="{m}"/></geometry></collision>\n' for m in meshes)
     return f"""<?xml version="1.0"?>
 <!-- Learned effective friction {model.friction:.4f}; PyBullet multiplies: use a ground of lateral friction 1.0. -->
 <robot name={quoteattr(name)}>
@@ -81,8 +82,8 @@ def urdf_text(model: ContactModel, name: str, meshes: list[str]) -> str:
 
 def mjcf_text(model: ContactModel, name: str, meshes: list[str]) -> str:
     """MJCF with one free body. Include it in a scene with a plane."""
-    I = model.inertia_kgm2
-    full = _numbers(np.array([I[0, 0], I[1, 1], I[2, 2], I[0, 1], I[0, 2], I[1, 2]]))
+    inertia = model.inertia_kgm2
+    full = _numbers(inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]])
     assets = "".join(f'    <mesh name="{m[:-4]}" file="{m}"/>\n' for m in meshes)
     geoms = "".join(
         f'      <geom class="touch" type="mesh" mesh="{m[:-4]}" friction="{model.friction:.9g} 0.0001 0.00001"/>\n'

@@ -30,7 +30,13 @@ def draw_result(
     time_ms = 1e3 * evaluation.errors.step_s * np.arange(1, evaluation.errors.position_m.shape[1] + 1)
     marked = np.isin(evaluation.errors.tosses, unlearned)
     _errors(
-        figure.add_subplot(grid[0, :3]), time_ms, 1e3 * evaluation.errors.position_m, evaluation.position, 1e3, marked, "mm"
+        figure.add_subplot(grid[0, :3]),
+        time_ms,
+        1e3 * evaluation.errors.position_m,
+        evaluation.position,
+        1e3,
+        marked,
+        "mm",
     )
     _errors(
         figure.add_subplot(grid[0, 3:]),
@@ -48,7 +54,8 @@ def draw_result(
     count = len(evaluation.errors.tosses)
     figure.suptitle(
         (title + ": " if title else "")
-        + f"learned from {len(learning.tosses)} tosses, rolled out on {count} (step {evaluation.errors.step_s * 1e3:.2f} ms)",
+        + f"learned from {len(learning.tosses)} tosses, rolled out on {count} "
+        + f"(step {evaluation.errors.step_s * 1e3:.2f} ms)",
         x=0.01,
         ha="left",
         fontsize=12,
@@ -75,11 +82,21 @@ def _errors(
     both = bool(marked.any() and not marked.all())
     for row, special in zip(errors, marked):
         axes.plot(
-            time_ms, row, lw=1.4 if both and special else 0.5, color=RED if both and special else GREY, alpha=0.55, zorder=1
+            time_ms,
+            row,
+            lw=1.4 if both and special else 0.5,
+            color=RED if both and special else GREY,
+            alpha=0.55,
+            zorder=1,
         )
-    axes.fill_between(time_ms, unit * summary.curve_low, unit * summary.curve_high, color=BLUE, alpha=0.25, lw=0, zorder=2)
+    axes.fill_between(
+        time_ms, unit * summary.curve_low, unit * summary.curve_high, color=BLUE, alpha=0.25, lw=0, zorder=2
+    )
     axes.plot(time_ms, unit * summary.curve, color=BLUE, lw=2.2, zorder=3)
-    top = max(float(np.nanpercentile(errors[:, -max(len(time_ms) // 4, 1) :], 97)), float(np.nanmax(unit * summary.curve_high)))
+    top = max(
+        float(np.nanpercentile(errors[:, -max(len(time_ms) // 4, 1) :], 97)),
+        float(np.nanmax(unit * summary.curve_high)),
+    )
     axes.set(xlim=(0, time_ms[-1]), ylim=(0, 1.05 * top), xlabel="time since the start of the rollout, ms")
     what = "position error, mm" if name == "mm" else "rotation error, deg"
     axes.set_title(
@@ -115,7 +132,9 @@ def _outline(axes: Any, learning: ContactLearning, a: int, b: int) -> None:
 def _sweep(axes: Any, learning: ContactLearning) -> None:
     axes.set_title("held-out rollouts by weight of dissipation", fontsize=9, loc="left", color=INK)
     if learning.sweep is None:
-        axes.text(0.5, 0.5, f"weight {learning.weights.dissipation:g}, not searched", ha="center", color=INK, fontsize=9)
+        axes.text(
+            0.5, 0.5, f"weight {learning.weights.dissipation:g}, not searched", ha="center", color=INK, fontsize=9
+        )
         axes.set_axis_off()
         return
     tried = learning.sweep.candidates

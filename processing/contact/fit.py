@@ -1,6 +1,7 @@
 """The parameter vector of a fit, and the optimisers: L-BFGS for a box, Adam with a cosine schedule for free points.
 
-Layout of a parameter vector: shape | square root of friction | inertia (6) | centre of mass (3) | plane (1); lengths in SCALE_M.
+Layout of a parameter vector: shape | square root of friction | inertia (6) | centre of mass (3) | plane (1);
+lengths in SCALE_M.
 """
 
 from __future__ import annotations
@@ -61,7 +62,8 @@ class Model:
     def __post_init__(self) -> None:
         if self.config.learn_plane and self.config.learn_shape:
             raise BadInput(
-                "the size of the object and the height of the plane cannot both be learned: raising the plane looks like "
+                "the size of the object and the height of the plane cannot both be learned: raising the plane looks "
+                "like "
                 "shrinking the object; calibrate the plane (`toss-calibrate table SESSION`) or keep the shape fixed"
             )
 
@@ -143,7 +145,14 @@ class _Objective:
         return Fit(found, loss / LOSS_SCALE, self.evaluations, self.failures, self.last_failures)
 
 
-def fit_lbfgs(model: Model, start: Float[Array, " p"], data: StepData, weights: Weights, iterations: int, tolerance: float = TOLERANCE) -> Fit:
+def fit_lbfgs(
+    model: Model,
+    start: Float[Array, " p"],
+    data: StepData,
+    weights: Weights,
+    iterations: int,
+    tolerance: float = TOLERANCE,
+) -> Fit:
     """Full-batch L-BFGS (scipy's: importing torch.optim costs a CPU second)."""
     from scipy.optimize import minimize
 

@@ -29,8 +29,11 @@ CORNERS = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in
 class Geometry(Protocol):
     """What the fit asks of a shape: a parameter vector (without unit, of order one) and the points it stands for."""
 
-    name: GeometryName
-    contacts: int
+    @property
+    def name(self) -> GeometryName: ...
+
+    @property
+    def contacts(self) -> int: ...
 
     def start(self) -> Float[Array, " p"]: ...
 

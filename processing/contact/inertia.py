@@ -79,9 +79,7 @@ def uniform_box_physics(edges_m: Float[Array, "3"], mass_kg: float = 1.0) -> Phy
     return Physics(mass_kg, np.zeros(3), inertia, "unit mass, uniform density over the starting box")
 
 
-def inertia_from(
-    parameters: Float[Tensor, "6"], start_kgm2: Float[Tensor, "3 3"]
-) -> Float[Tensor, "3 3"]:
+def inertia_from(parameters: Float[Tensor, "6"], start_kgm2: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"]:
     """I = tr(S) 1 - S with S = L L', L = L0 E(parameters): every parameter vector is a body's inertia, 0 is the start.
 
     S is the second moment of mass; the triangle inequality of the moments holds because S is positive definite.

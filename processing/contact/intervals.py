@@ -1,9 +1,11 @@
 """How sure the learned numbers are: a bootstrap over tosses, or the loss's curvature where there is one toss only.
 
-Bootstrap: tosses are drawn with replacement, the fit is repeated from the optimum with those weights; the interval is the
+Bootstrap: tosses are drawn with replacement, the fit is repeated from the optimum with those weights; the interval
+is the
 optimum -+ t * standard deviation of the repeats.
 Curvature: in four directions (friction, and stretching the object along each axis) the loss of every transition is
-differenced. With H the mean Hessian and G the variance of the mean gradient, summed over neighbouring frames because one
+differenced. With H the mean Hessian and G the variance of the mean gradient, summed over neighbouring frames
+because one
 contact lasts several (Newey and West 1987), the covariance is H^-1 G H^-1 (White 1982), bounded by a wide prior.
 """
 
@@ -25,8 +27,15 @@ from processing.contact.loss import StepData, Weights, contact_loss, idle_terms,
 PRIOR_FRICTION, PRIOR_SIZE_M = 0.3, 0.02
 """Standard deviations that nothing was learned from."""
 CONTACT_LASTS_S = 0.05
-DIFFERENCE = 2e-3
-"""Step of the numerical derivatives: of friction, and of the relative size."""
+DIFFERENCE_FRICTION, DIFFERENCE_SIZE = 0.02, 0.03
+"""Steps of the numerical derivatives: of friction and of the relative size. They reach over the kinks of the loss,
+where
+another point becomes the lowest: closer by, a kink would pass for certainty."""
+MODEL_FRICTION, MODEL_SIZE = 0.015, 0.12
+"""Standard deviations (size: relative) that one toss leaves because the model is not the world (a rebound, a tilt
+of the
+plane, corners that never touched): the spread of single real tosses beyond their curvature, tools/bench_contact.py
+one."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +105,7 @@ def bootstrap(
 def curvature(model: Model, optimum: Float[Array, " p"], data: StepData, weights: Weights) -> Spread:
     """Intervals of friction and extents from the loss around the optimum."""
     center = [float(optimum[FRICTION] ** 2), 1.0, 1.0, 1.0]
-    steps = np.array([DIFFERENCE] * 4)
+    steps = np.array([DIFFERENCE_FRICTION] + [DIFFERENCE_SIZE] * 3)
 
     def losses(move: Float[Array, "4"]) -> Float[Array, " n"]:
         return _row_losses(model, optimum, data, weights, np.maximum(np.array(center) + move, 1e-6))
@@ -114,7 +123,9 @@ def curvature(model: Model, optimum: Float[Array, " p"], data: StepData, weights
     size = extents(model.numbers(optimum).points_m.cpu().numpy())
     prior = np.array([PRIOR_FRICTION, *(PRIOR_SIZE_M / size)])
     covariance, freedom = _sandwich(H, gradient, data, prior)
-    width = float(student.ppf(0.975, freedom)) * np.sqrt(np.diag(covariance))
+    model_error = np.array([MODEL_FRICTION] + [MODEL_SIZE] * 3)
+    curved = float(student.ppf(0.975, freedom)) * np.sqrt(np.diag(covariance))
+    width = np.sqrt(curved**2 + (1.96 * model_error) ** 2)
     unknown = np.full(3, np.nan)
     return Spread("curvature of the loss", float(width[0]), width[1:] * size, None, unknown, np.full(6, np.nan))
 

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from numpy import ndarray as Array
 
 from processing.contact import data_checks as checks
-from processing.contact.fit import FRICTION, INERTIA, SHAPE, Fit, FitConfig, Model, fit
-from processing.contact.geometry import SCALE_M, GeometryName
-from processing.contact.inertia import Physics, inertia_from
+from processing.contact.fit import FRICTION, Fit, FitConfig, Model, fit
+from processing.contact.geometry import GeometryName
+from processing.contact.inertia import Physics
 from processing.contact.intervals import Interval, Spread, bootstrap, curvature, extents
 from processing.contact.loss import REFERENCE_MASS_KG, Body, StepData, Weights, contact_loss
 from processing.contact.motion import PoseSeries, Steps, steps_of
@@ -111,10 +111,9 @@ class Prepared:
     left_out: Mapping[int, str]
 
 
-def prepare(
-    tracks: Sequence[PoseSeries], frame: Frame, plane: Plane, inertia: Float[Array, "3 3"]
-) -> Prepared:
-    """Move tracks to the learning frame, check them one by one, smooth them. What cannot be used is left out and named."""
+def prepare(tracks: Sequence[PoseSeries], frame: Frame, plane: Plane, inertia: Float[Array, "3 3"]) -> Prepared:
+    """Move tracks to the learning frame, check them one by one, smooth them. What cannot be used is left out and
+    named."""
     level = plane.level_from_world()
     kept, smoothed, left_out = [], [], {}
     for track in tracks:
@@ -132,16 +131,15 @@ def prepare(
 
 
 def starts(prepared: Prepared) -> tuple[Start, list[int]]:
-    """The smoothed state and the frame each toss is rolled out from: the release (frame 0 where no flight was found)."""
+    """The smoothed state and the frame each toss is rolled out from: the release (frame 0 where no flight was
+    found)."""
     begin = [s.phases.release or 0 for s in prepared.smoothed]
     states = [s.states for s in prepared.smoothed]
 
     def rows(name: str) -> Float[Array, "n ..."]:
         return np.stack([getattr(s, name)[b] for s, b in zip(states, begin)])
 
-    start = Start(
-        rows("rotation"), rows("position_m"), rows("spin_object_rad_s"), rows("velocity_world_m_s")
-    )
+    start = Start(rows("rotation"), rows("position_m"), rows("spin_object_rad_s"), rows("velocity_world_m_s"))
     return start, begin
 
 
@@ -155,7 +153,8 @@ def learn_contact(
 ) -> ContactLearning:
     """Learn geometry and friction from `world_from_object` tracks.
 
-    Raises BadInput for data that contradict themselves (see data_checks), for no contact, and for learning plane and size.
+    Raises BadInput for data that contradict themselves (see data_checks), for no contact, and for learning plane
+    and size.
     """
     began = time.perf_counter()
     plane, config, progress = plane or Plane(), config or ContactConfig(), progress or Silent()
@@ -187,7 +186,7 @@ def learn_contact(
     touched = touched_points(fitted, body, data, weights)
     _check_learned_plane(prepared, body)
     model, shape, friction, sizes = _results(fitted, optimum, spread, prior, physics, plane, touched)
-    left_out = {**prepared.left_out, **{t: "the same recording as another toss" for t in sorted(again)}}
+    left_out = {**prepared.left_out, **dict.fromkeys(sorted(again), "the same recording as another toss")}
     progress.step(6, 6, "learned")
     return ContactLearning(
         model=model,
@@ -248,9 +247,7 @@ def _steps(prepared: Prepared, config: ContactConfig) -> Steps:
     """Transitions from the release on: what a hand does is not learned."""
     from processing.contact.motion import differences
 
-    states = [
-        s.states if config.smooth else differences(t) for t, s in zip(prepared.tracks, prepared.smoothed)
-    ]
+    states = [s.states if config.smooth else differences(t) for t, s in zip(prepared.tracks, prepared.smoothed)]
     steps = steps_of(states)
     release = {s.states.toss: s.phases.release or 0 for s in prepared.smoothed}
     begin = np.array([release[t] for t in steps.toss.tolist()])
@@ -262,7 +259,8 @@ def _require_contact(fitted: Model, steps: Steps, prepared: Prepared) -> None:
     touching = [s for s in prepared.smoothed if not s.phases.in_flight.all()]
     if len(steps) == 0 or not touching:
         raise BadInput(
-            f"no contact in the data: free flight explains all {len(steps)} transitions of {len(prepared.tracks)} tosses; "
+            f"no contact in the data: free flight explains all {len(steps)} transitions of {len(prepared.tracks)} "
+            "tosses; "
             "wanted tosses that are recorded until the object has hit the plane"
         )
 

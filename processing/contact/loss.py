@@ -1,7 +1,8 @@
 """The ContactNets loss, term by term, over all transitions at once.
 
 After Pfrommer, Halm and Posa 2020 in the form of dair_pll (Bianchini et al. 2023). For a transition to the state (R, p)
-with velocities before and after, its k lowest points i with height phi_i and velocity v_i, and dv the change of velocity
+with velocities before and after, its k lowest points i with height phi_i and velocity v_i, and dv the change of
+velocity
 that free flight does not explain:
 
     L = min over lam in K of  w_pred [1/2 dv' M dv - lam' J dv + 1/2 lam' (D + eps) lam]     prediction
@@ -10,7 +11,8 @@ that free flight does not explain:
                             + w_pen  sum_i max(0, -phi_i)^2                                  non-penetration
     D = J M^-1 J',   J's rows of a contact: (mu t1, mu t2, n),   K = product of {lam_n >= |lam_t|}
 
-Everything is evaluated in the later state. The gradient is the envelope theorem's: lam is a constant in it. The plane is
+Everything is evaluated in the later state. The gradient is the envelope theorem's: lam is a constant in it. The
+plane is
 z = 0. Mass cannot be observed in tosses, so M is always that of REFERENCE_MASS_KG (the cube of the paper) with the
 inertia in proportion: eps and the weights then mean the same for every object.
 """
@@ -23,7 +25,6 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
-from numpy import ndarray as Array
 from torch import Tensor
 
 from processing.contact.motion import GRAVITY_M_S2, Steps
@@ -80,7 +81,8 @@ class Contacts:
 
 
 class StepData:
-    """Transitions as tensors, with a weight for each and the warm start of the inner problem (changes as it is used)."""
+    """Transitions as tensors, with a weight for each and the warm start of the inner problem (changes as it is
+    used)."""
 
     def __init__(self, steps: Steps, device: str = "cpu") -> None:
         def tensor(values: Any) -> Tensor:
@@ -155,7 +157,10 @@ def find_contacts(
 
 
 def point_velocity(
-    rotation: Float[Tensor, "n 3 3"], arm: Float[Tensor, "n k 3"], spin: Float[Tensor, "n 3"], velocity: Float[Tensor, "n 3"]
+    rotation: Float[Tensor, "n 3 3"],
+    arm: Float[Tensor, "n k 3"],
+    spin: Float[Tensor, "n 3"],
+    velocity: Float[Tensor, "n 3"],
 ) -> Float[Tensor, "n k 3"]:
     """v + R (w x s) of points s, world axes."""
     swept = torch.linalg.cross(spin[:, None].expand_as(arm), arm)
@@ -163,7 +168,10 @@ def point_velocity(
 
 
 def jacobian(
-    rotation: Float[Tensor, "n 3 3"], friction: Float[Tensor, "*f"], inertia_kgm2: Float[Tensor, "3 3"], arm: Float[Tensor, "n k 3"]
+    rotation: Float[Tensor, "n 3 3"],
+    friction: Float[Tensor, "*f"],
+    inertia_kgm2: Float[Tensor, "3 3"],
+    arm: Float[Tensor, "n k 3"],
 ) -> Float[Tensor, "n k 3 6"]:
     """A = J M^-1/2: rows (mu t1, mu t2, n) of each contact; columns are the six directions of momentum.
 
@@ -179,7 +187,12 @@ def jacobian(
 
 
 def prediction(
-    data: StepData, body: Body, free: FreeMotion, arm: Float[Tensor, "n k 3"], lam: Float[Tensor, "n k 3"], epsilon: float
+    data: StepData,
+    body: Body,
+    free: FreeMotion,
+    arm: Float[Tensor, "n k 3"],
+    lam: Float[Tensor, "n k 3"],
+    epsilon: float,
 ) -> Float[Tensor, " n"]:
     """1/2 dv' M dv - lam' J dv + 1/2 lam' (D + eps) lam >= 0, in J: the momentum that the impulses do not explain."""
     one = torch.ones_like(body.friction)
@@ -269,9 +282,7 @@ class StepTerms:
         )
 
 
-def step_terms(
-    data: StepData, body: Body, impulses: Impulses, contacts: int, epsilon: float = EPSILON
-) -> StepTerms:
+def step_terms(data: StepData, body: Body, impulses: Impulses, contacts: int, epsilon: float = EPSILON) -> StepTerms:
     """The terms of the rows at their impulses (constants). A failed row's impulse lies in the cones too, so its terms
     are an upper bound and it stays in (and is counted); only numbers that overflowed are left out."""
     finite = torch.isfinite(impulses.impulse).all(-1).all(-1)
@@ -299,7 +310,9 @@ def idle_terms(data: StepData, body: Body, impulses: Impulses, contacts: int) ->
     spin_energy = ((free.spin_change @ body.inertia_kgm2) * free.spin_change).sum(-1)
     energy = 0.5 * (REFERENCE_MASS_KG * free.velocity_change.square().sum(-1) + spin_energy)
     none = torch.zeros_like(energy)
-    return StepTerms(rows, energy, none, none, penetration(find_contacts(part.rotation, part.position_m, body, contacts).height_m))
+    return StepTerms(
+        rows, energy, none, none, penetration(find_contacts(part.rotation, part.position_m, body, contacts).height_m)
+    )
 
 
 @dataclass(frozen=True, eq=False)

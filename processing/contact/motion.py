@@ -82,7 +82,8 @@ class PoseSeries:
         good = np.isfinite(q).all(1) & (length > 1e-9) & np.isfinite(position_m).all(1)
         if not good.all():
             raise BadInput(
-                f"toss {toss}: the pose of frame {int(np.argmin(good))} ({int((~good).sum())} of {len(good)}) is NaN or "
+                f"toss {toss}: the pose of frame {int(np.argmin(good))} ({int((~good).sum())} of {len(good)}) is NaN "
+                "or "
                 "has a zero quaternion; wanted finite poses, leave lost frames out"
             )
         rotation = Rotation.from_quat(q[:, [1, 2, 3, 0]]).as_matrix()

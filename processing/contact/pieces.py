@@ -50,7 +50,7 @@ def _hull_volume(triangles: Float[Array, "t 3 3"]) -> float:
     return float(ConvexHull(points).volume)
 
 
-Cut = tuple[float, int, list[Float[Array, "t 3 3"]]]
+Cut = tuple[float, int, list[Array]]
 
 
 def _best_cut(triangles: Float[Array, "t 3 3"], at: int, axes: Float[Array, "3 3"]) -> Cut:
@@ -69,7 +69,7 @@ def _best_cut(triangles: Float[Array, "t 3 3"], at: int, axes: Float[Array, "3 3
     return best
 
 
-def _above(triangles: Float[Array, "t 3 3"], axis: Float[Array, "3"], level: float) -> Float[Array, "t 3 3"]:
+def _above(triangles: Float[Array, "t 3 3"], axis: Float[Array, "3"], level: float) -> Float[Array, "u 3 3"]:
     """The part of the triangles with axis . x >= level, triangulated."""
     heights = triangles @ axis - level
     kept = [triangles[(heights >= 0).all(1)]]

@@ -27,7 +27,8 @@ DEFAULT_STEP_S = 1.0 / 148.0
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """States to roll out from, one row per toss: of the prior's centre of mass, in the world with the plane at z = 0."""
+    """States to roll out from, one row per toss: of the prior's centre of mass, in the world with the plane at z =
+    0."""
 
     rotation: Float[Array, "n 3 3"]
     position_m: Float[Array, "n 3"]

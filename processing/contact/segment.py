@@ -1,7 +1,8 @@
 """Phases of a toss from its track alone: in hand, flight, contact, rest.
 
 The frames are cut into segments so that the sum of their misfits plus a price per segment is least (dynamic
-programming). A segment is ballistic (free position and velocity, gravity given, torque-free spin) or at rest (one pose).
+programming). A segment is ballistic (free position and velocity, gravity given, torque-free spin) or at rest (one
+pose).
 What neither fits falls apart into single frames: contact, or a hand.
 """
 

@@ -1,11 +1,13 @@
 """A smoother on SE(3) that is ballistic between contacts and lets go where something touches.
 
-The most probable poses given white pose noise and a velocity that changes as free flight says, up to a small disturbance:
+The most probable poses given white pose noise and a velocity that changes as free flight says, up to a small
+disturbance:
 
     min  sum |p_k - p^_k|^2 / s_p^2 + sum |v_{k+1} - v_k - dt g|^2 / s_k^2,     v_{k+1} = (p_{k+1} - p_k) / dt
 
 and likewise for rotations on SO(3) with torque-free spin. s_k is small where two velocities belong to one flight (or to
-one rest, where the change is zero) and very large everywhere else, so nothing is smoothed across an impact: with an impact
+one rest, where the change is zero) and very large everywhere else, so nothing is smoothed across an impact: with an
+impact
 between frames j and j+1 the velocities of j, j+1 and j+2 are independent of each other.
 """
 
@@ -21,7 +23,8 @@ from processing.contact.motion import GRAVITY_M_S2, PoseSeries, States, differen
 from processing.contact.segment import Noise, Phases, find_phases, pose_noise
 
 FLIGHT_CHANGE_M_S, FLIGHT_CHANGE_RAD_S = 0.004, 0.05
-"""What free flight may leave unexplained in the velocities of neighbouring frames (drag, an inertia that is a guess)."""
+"""What free flight may leave unexplained in the velocities of neighbouring frames (drag, an inertia that is a
+guess)."""
 TOUCH_CHANGE_M_S, TOUCH_CHANGE_RAD_S = 20.0, 400.0
 """Where something touches: nothing is assumed."""
 ROUNDS = 5
@@ -37,7 +40,8 @@ class Smoothed:
 
 
 def smooth(series: PoseSeries, inertia: Float[Array, "3 3"], noise: Noise | None = None) -> Smoothed:
-    """Smooth one toss (poses of the centre of mass in a world with z up). Noise and phases come from the track itself."""
+    """Smooth one toss (poses of the centre of mass in a world with z up). Noise and phases come from the track
+    itself."""
     noise = pose_noise(series) if noise is None else noise
     phases = find_phases(series, inertia, noise)
     flying, resting = _joined(phases, "flight", len(series)), _joined(phases, "rest", len(series))
@@ -102,7 +106,11 @@ def _speed_variance(
 
 
 def _smooth_rotation(
-    series: PoseSeries, inertia: Float[Array, "3 3"], noise: Noise, flying: Bool[Array, " m"], resting: Bool[Array, " m"]
+    series: PoseSeries,
+    inertia: Float[Array, "3 3"],
+    noise: Noise,
+    flying: Bool[Array, " m"],
+    resting: Bool[Array, " m"],
 ) -> tuple[Float[Array, "n 3 3"], Float[Array, "n 3 3"], Float[Array, "n 3 3"]]:
     """Gauss-Newton on R_k exp(d_k). The change of spin is taken as linear in d with the turns between frames as they
     are (transported to the middle frame), which the rounds correct."""
@@ -127,7 +135,9 @@ def _smooth_rotation(
     own, later, cross = covariance[k, k], covariance[k + 1, k + 1], covariance[k, k + 1]
     turn = np.swapaxes(rotation[:-1], 1, 2) @ rotation[1:]
     carried = np.swapaxes(turn, 1, 2) @ cross
-    spin = (np.swapaxes(turn, 1, 2) @ own @ turn + later - carried - np.swapaxes(carried, 1, 2)) / dt[:, None, None] ** 2
+    spin = (np.swapaxes(turn, 1, 2) @ own @ turn + later - carried - np.swapaxes(carried, 1, 2)) / dt[
+        :, None, None
+    ] ** 2
     return rotation, covariance[np.arange(n), np.arange(n)], np.concatenate([spin[:1], spin])
 
 
@@ -139,7 +149,8 @@ def _torque_free(series: PoseSeries, inertia: Float[Array, "3 3"]) -> Float[Arra
 
 
 def _spin_jacobian(rotation: Float[Array, "n 3 3"], dt: Float[Array, " m"]) -> Float[Array, "a b"]:
-    """d(w_{k+2} - w_{k+1}) / d(d_k, d_{k+1}, d_{k+2}): w = log(R_k' R_{k+1}) / dt moves by Jr^-1 d_{k+1} - Jl^-1 d_k."""
+    """d(w_{k+2} - w_{k+1}) / d(d_k, d_{k+1}, d_{k+2}): w = log(R_k' R_{k+1}) / dt moves by Jr^-1 d_{k+1} - Jl^-1
+    d_k."""
     n = len(rotation)
     turn = rotation_vectors(np.swapaxes(rotation[:-1], 1, 2) @ rotation[1:])
     right = _right_jacobian_inverse(turn) / dt[:, None, None]

@@ -11,6 +11,7 @@ Components of a contact are in the order (tangent, tangent, normal), tangents al
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import no_type_check
 
 import torch
 from jaxtyping import Bool, Float
@@ -34,6 +35,7 @@ class ConeSolution:
     iterations: int
 
 
+@no_type_check  # called thousands of times: checking its shapes costs more than it
 def project(y: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
     """Nearest point of the Lorentz cone {y_2 >= |y_01|}."""
     tangent, normal = y[..., :2], y[..., 2]
@@ -45,6 +47,7 @@ def project(y: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
     return torch.where((polar & ~inside)[..., None], torch.zeros_like(y), out)
 
 
+@no_type_check
 def project_jacobian(y: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3 3"]:
     """Derivative of `project`: on the cone's edge 1/2 [[(1+r) 1 - r u u', u], [u', 1]], r = normal / |tangent|."""
     tangent, normal = y[..., :2], y[..., 2]
@@ -79,6 +82,7 @@ class _Batch:
         self.rows = torch.arange(len(A), device=A.device)
         self.y, self.impulse, self.value = self.at(A, q, v)
 
+    @no_type_check
     def at(
         self, A: Float[Tensor, "m k3 6"], q: Float[Tensor, "m k3"], v: Float[Tensor, "m 6"]
     ) -> tuple[Float[Tensor, "m k3"], Float[Tensor, "m k3"], Float[Tensor, " m"]]:
@@ -86,13 +90,16 @@ class _Batch:
         impulse = project(y.view(len(y), y.shape[1] // 3, 3)).view(y.shape)
         return y, impulse, 0.5 * v.square().sum(-1) + 0.5 * self.epsilon * impulse.square().sum(-1)
 
+    @no_type_check
     def keep(self, rows: Bool[Tensor, " n"]) -> None:
         for name in ("A", "q", "v", "rows", "y", "impulse", "value"):
             setattr(self, name, getattr(self, name)[rows])
 
+    @no_type_check
     def momentum(self) -> Float[Tensor, "n 6"]:
         return torch.bmm(self.A.transpose(1, 2), self.impulse[..., None])[..., 0]
 
+    @no_type_check
     def newton(self, gradient: Float[Tensor, "n 6"]) -> Float[Tensor, "n 6"]:
         n, k3, _ = self.A.shape
         D = project_jacobian(self.y.view(n, -1, 3))
@@ -102,6 +109,7 @@ class _Batch:
         factor, _ = torch.linalg.cholesky_ex(H)
         return -torch.cholesky_solve(gradient[..., None], factor)[..., 0]
 
+    @no_type_check
     def search(self, direction: Float[Tensor, "n 6"], slope: Float[Tensor, " n"]) -> None:
         """Step along a direction to where the slope of the value has nearly vanished.
 

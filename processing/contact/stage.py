@@ -56,8 +56,7 @@ def run_stage(
     if not learned or not tested:
         raise BadInput(f"no poses of the tosses {missing} in {source.name}")
     marked = tuple(t for t in tested if t not in learned)
-    if marked and not set(tested) & set(learned):
-        refuse_leaks(learned, tested, duplicate_groups([tracks[t] for t in (*learned, *tested)]))
+    refuse_leaks(learned, marked, duplicate_groups([tracks[t] for t in sorted({*learned, *tested})]))
     plane = session_plane(session)
     given = physics_of_session(session.start)
     prior, physics = make_prior(geometry, init_m, source, given, [tracks[t] for t in learned], plane)
@@ -179,11 +178,16 @@ def make_prior(
     """What to start from: the vision shape, a cube of --init, or a cube as high as the object rests."""
     if source.shape is not None and init_m is None:
         physics = given or uniform_physics(source.shape)
-        physics = physics if given is None else replace(physics, center_of_mass_m=uniform_physics(source.shape).center_of_mass_m)
+        physics = (
+            physics
+            if given is None
+            else replace(physics, center_of_mass_m=uniform_physics(source.shape).center_of_mass_m)
+        )
         return prior_from_shape(geometry or "hull", source.shape, physics), physics  # type: ignore[arg-type]
     if geometry == "nonconvex":
         raise BadInput(
-            "--geometry nonconvex needs a shape to start from (where contact never reaches, it stands); these poses come "
+            "--geometry nonconvex needs a shape to start from (where contact never reaches, it stands); these "
+            "poses come "
             "without one: run vision first (`toss-process SESSION`), or use --geometry hull"
         )
     side = resting_side_m(tracks, plane) if init_m is None else init_m

@@ -1,6 +1,7 @@
 """Impacts that the plane cannot explain: a finger, the table's edge, a second surface.
 
-A change of velocity is explained when impulses at points within reach of the plane, in a generous friction cone, produce
+A change of velocity is explained when impulses at points within reach of the plane, in a generous friction cone,
+produce
 it. What is left, over sqrt(mass), is a speed; above a threshold the transition is left out and counted.
 """
 
@@ -12,7 +13,15 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from processing.contact.loss import REFERENCE_MASS_KG, Body, StepData, find_contacts, free_motion, jacobian, point_velocity
+from processing.contact.loss import (
+    REFERENCE_MASS_KG,
+    Body,
+    StepData,
+    find_contacts,
+    free_motion,
+    jacobian,
+    point_velocity,
+)
 from processing.contact.solver import solve_cones
 
 REACH_M = 0.01

@@ -1,9 +1,12 @@
 """Choosing the weight of the dissipation term by rollouts of tosses that were not learned from.
 
-With the paper's equal weights, pose noise reads as friction. The ratio of dissipation to complementarity cures that, but
-how large it must be depends on the noise; so it is searched: at each candidate the model is fitted to all tosses but one
-fold and rolled out on that fold. Chosen is the largest weight whose mean position error is within one standard error
-(paired over tosses) of the best one: noisy first states make rollouts prefer too much friction, never too little.
+With the paper's equal weights, pose noise reads as friction. The ratio of dissipation to complementarity cures
+that, but
+how large it must be depends on the noise; so it is searched: at each candidate the model is fitted to all tosses
+but one
+fold and rolled out on that fold. Noisy first states make rollouts prefer too much friction, never too little; so
+not the
+best weight is chosen, but the middle between it and the largest one within one standard error (paired over tosses).
 """
 
 from __future__ import annotations
@@ -99,14 +102,18 @@ def sweep_weights(
 
 
 def choose(candidates: Sequence[Candidate]) -> Candidate:
-    """The largest weight within one paired standard error of the best."""
+    """The middle (of logarithms, rounded up) between the best weight and the largest one within a paired standard
+    error."""
     best = min(candidates, key=lambda c: float(c.error_m.mean()))
 
     def close(c: Candidate) -> bool:
         worse = c.error_m - best.error_m
         return float(worse.mean()) <= float(worse.std(ddof=1)) / len(worse) ** 0.5
 
-    return max([best, *filter(close, candidates)], key=lambda c: c.dissipation)
+    largest = max([best, *filter(close, candidates)], key=lambda c: c.dissipation)
+    middle = (best.dissipation * largest.dissipation) ** 0.5
+    between = [c for c in candidates if best.dissipation <= c.dissipation <= largest.dissipation]
+    return min(between, key=lambda c: (round(abs(np.log(c.dissipation / middle)), 2), -c.dissipation))
 
 
 def _try(
