@@ -20,7 +20,7 @@ from processing.track.motion import MotionConfig, change_cost, moved, steady_spi
 from processing.track.views import ViewStore
 from recordings.geometry import rotation_exp
 
-Schedule = tuple[tuple[float, float, float, float, float, float], ...]
+Schedule = tuple[tuple[int, int, float, float, float, float], ...]
 """Rows of kernels.align_view: level (0 sharp, 1 smooth), steps, depth scale (m at 0.8 m), scale of the looks, outline
 scale (m at 0.8 m), share of the samples."""
 

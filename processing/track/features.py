@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import cv2
 import numpy as np
@@ -25,6 +25,7 @@ class Features:
     descriptors: Float32[Array, "n d"]
 
 
+@runtime_checkable
 class FeatureMatcher(Protocol):
     """Finds and matches feature points on the object. One class per backend."""
 

@@ -229,7 +229,7 @@ def motion_residual(
     return residual, jacobians
 
 
-def _covariances(H: Float[Array, "f f"], free: Int[Array, " f"], n: int) -> Float[Array, "n 6 6"]:
+def _covariances(H: Float[Array, "d d"], free: Int[Array, " f"], n: int) -> Float[Array, "n 6 6"]:
     """Each free view's own block of the inverse; zero for the fixed, NaN elsewhere is left to the caller."""
     out = np.zeros((n, 6, 6))
     inverse = np.linalg.inv(H + 1e-9 * np.trace(H) / len(H) * np.eye(len(H)))

@@ -112,6 +112,7 @@ def cut(
     h, w = straight_mask.shape
     top, bottom = max(rows[0] - config.margin_px, 0), min(rows[-1] + config.margin_px + 1, h)
     left, right = max(columns[0] - config.margin_px, 0), min(columns[-1] + config.margin_px + 1, w)
+    left, top = int(left), int(top)
     area = np.s_[top:bottom, left:right]
     color = optics.straight(frame.color_rgb, smooth=True)[area].astype(np.float32) / np.float32(255.0 * gain)
     depth_m = np.ascontiguousarray(optics.straight(frame.depth_m, smooth=False)[area])
