@@ -16,7 +16,7 @@ from jaxtyping import Float
 from numpy import ndarray as Array
 
 from groundtruth import se3
-from groundtruth.graph import CORNERS
+from groundtruth.factors import CORNERS
 from groundtruth.problem import Key, Observation, Problem, camera_key, tag_key
 
 

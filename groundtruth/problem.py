@@ -14,7 +14,7 @@ from jaxtyping import Float, Int64
 from numpy import ndarray as Array
 
 from groundtruth.detections import Recording
-from groundtruth.graph import CORNERS
+from groundtruth.factors import CORNERS
 from groundtruth.tagslam_config import BodyEntry, CameraEntry, TagEntry, TagSlamConfig
 from recordings.errors import BadInput
 from recordings.geometry import CameraModel

@@ -12,19 +12,8 @@ from numpy import ndarray as Array
 
 from groundtruth import se3
 from groundtruth.detections import Recording
-from groundtruth.graph import (
-    CORNERS,
-    Between,
-    Coordinate,
-    Distance,
-    Graph,
-    Prior,
-    Projection,
-    Solution,
-    SolverConfig,
-    Undetermined,
-    solve,
-)
+from groundtruth.factors import CORNERS, Between, Coordinate, Distance, Prior, Projection
+from groundtruth.graph import Graph, Solution, SolverConfig, Undetermined, solve
 from groundtruth.grow import GrowConfig, Growth, chain
 from groundtruth.problem import (
     Key,

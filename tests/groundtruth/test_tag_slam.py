@@ -13,19 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from groundtruth import se3
 from groundtruth.detections import read_recording
-from groundtruth.graph import (
-    CORNERS,
-    Between,
-    Coordinate,
-    Distance,
-    Graph,
-    Prior,
-    Projection,
-    SolverConfig,
-    Undetermined,
-    covariances,
-    solve,
-)
+from groundtruth.factors import CORNERS, Between, Coordinate, Distance, Prior, Projection
+from groundtruth.graph import Graph, SolverConfig, Undetermined, covariances, solve
 from groundtruth.problem import planar_poses
 from groundtruth.tag_slam import run_tag_slam
 from groundtruth.tagslam_config import NoisyPose, read_config

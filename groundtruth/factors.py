@@ -1,0 +1,149 @@
+"""Factors between poses: what was measured, and for all factors of a kind at once their residuals and Jacobians.
+
+Each `..._terms` gives whitened residuals (m, d), their Jacobians (m, d, 6) by each pose, and the poses' indices (m, k).
+Jacobians are by a twist (rotation, translation) on the right of a pose.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray as Array
+
+from groundtruth import se3
+
+Terms = tuple[Array, list[Array], Array]
+CORNERS = np.array([[-0.5, -0.5, 0.0], [0.5, -0.5, 0.0], [0.5, 0.5, 0.0], [-0.5, 0.5, 0.0]])
+"""Corners of a tag of size 1 in TagSLAM's tag frame (y up on the printed tag)."""
+
+
+@dataclass(frozen=True)
+class Projection:
+    """One tag seen by one camera: indices of the four poses in the chain, and the corners (4, 2) in pixels."""
+
+    camera: int
+    rig_from_camera: int
+    world_from_rig: int
+    world_from_body: int
+    body_from_tag: int
+    size_m: float
+    corners_px: Float[Array, "4 2"]
+    sigma_px: float
+
+
+@dataclass(frozen=True)
+class Prior:
+    pose: int
+    mean: Float[Array, "4 4"]
+    root_information: Float[Array, "6 6"]
+
+
+@dataclass(frozen=True)
+class Between:
+    """pose_a^-1 pose_b is about `delta`."""
+
+    pose_a: int
+    pose_b: int
+    delta: Float[Array, "4 4"]
+    root_information: Float[Array, "6 6"]
+
+
+@dataclass(frozen=True)
+class Coordinate:
+    """direction . (world point of a tag's corner, or of its centre for corner -1) is about `length_m`."""
+
+    world_from_body: int
+    body_from_tag: int
+    point_tag_m: Float[Array, "3"]
+    direction: Float[Array, "3"]
+    length_m: float
+    sigma_m: float
+
+
+@dataclass(frozen=True)
+class Distance:
+    """The distance between two points on tags is about `length_m`."""
+
+    world_from_body: tuple[int, int]
+    body_from_tag: tuple[int, int]
+    points_tag_m: tuple[Float[Array, "3"], Float[Array, "3"]]
+    length_m: float
+    sigma_m: float
+
+
+def prior_terms(priors: list[Prior], poses: Array) -> Terms:
+    """r = root log(mean^-1 pose)."""
+    index = np.array([[p.pose] for p in priors])
+    root = np.stack([p.root_information for p in priors])
+    mean = np.stack([p.mean for p in priors])
+    error = se3.log(se3.inverse(mean) @ poses[index[:, 0]])
+    return (root @ error[..., None])[..., 0], [root @ _right_jacobian_inverse(error)], index
+
+
+def between_terms(betweens: list[Between], poses: Array) -> Terms:
+    """r = root log(delta^-1 pose_a^-1 pose_b)."""
+    index = np.array([[b.pose_a, b.pose_b] for b in betweens])
+    root = np.stack([b.root_information for b in betweens])
+    delta = np.stack([b.delta for b in betweens])
+    relative = se3.inverse(poses[index[:, 0]]) @ poses[index[:, 1]]
+    error = se3.log(se3.inverse(delta) @ relative)
+    by_b = root @ _right_jacobian_inverse(error)
+    by_a = -by_b @ se3.adjoint(se3.inverse(relative))
+    return (root @ error[..., None])[..., 0], [by_a, by_b], index
+
+
+def _right_jacobian_inverse(error: Float[Array, "n 6"]) -> Float[Array, "n 6 6"]:
+    """Inverse right Jacobian of SE(3) to second order: I + ad/2 + ad^2/12; exact enough below a radian."""
+    ad = np.zeros((len(error), 6, 6))
+    w, v = se3.skew(error[:, :3]), se3.skew(error[:, 3:])
+    ad[:, :3, :3], ad[:, 3:, 3:], ad[:, 3:, :3] = w, w, v
+    return np.eye(6) + 0.5 * ad + ad @ ad / 12
+
+
+def coordinate_terms(items: list[Coordinate], poses: Array) -> Terms:
+    """r = (direction . world point - length) / sigma."""
+    index = np.array([[c.world_from_body, c.body_from_tag] for c in items])
+    direction = np.stack([c.direction for c in items])[:, None, :]
+    points = np.stack([c.point_tag_m for c in items])[:, None, :]
+    sigma = np.array([c.sigma_m for c in items])
+    world, (by_body, by_tag) = _world_point(poses[index[:, 0]], poses[index[:, 1]], points)
+    residual = ((direction[:, 0] * world).sum(-1) - np.array([c.length_m for c in items])) / sigma
+    scale = 1 / sigma[:, None, None]
+    return residual[:, None], [direction @ by_body * scale, direction @ by_tag * scale], index
+
+
+def distance_terms(items: list[Distance], poses: Array) -> Terms:
+    """r = (|world point 1 - world point 0| - length) / sigma."""
+    index = np.array(
+        [[d.world_from_body[0], d.body_from_tag[0], d.world_from_body[1], d.body_from_tag[1]] for d in items]
+    )
+    sigma = np.array([d.sigma_m for d in items])
+    ends, jacobians = [], []
+    for i in (0, 1):
+        points = np.stack([d.points_tag_m[i] for d in items])[:, None, :]
+        world, J = _world_point(poses[index[:, 2 * i]], poses[index[:, 2 * i + 1]], points)
+        ends.append(world)
+        jacobians.append(J)
+    gap = ends[1] - ends[0]
+    length = np.linalg.norm(gap, axis=-1)
+    along = (gap / np.maximum(length, 1e-9)[:, None] / sigma[:, None])[:, None, :]
+    residual = (length - np.array([d.length_m for d in items])) / sigma
+    out = [-along @ jacobians[0][0], -along @ jacobians[0][1], along @ jacobians[1][0], along @ jacobians[1][1]]
+    return residual[:, None], out, index
+
+
+def _world_point(body: Array, tag: Array, points: Float[Array, "n 1 3"]) -> tuple[Array, tuple[Array, Array]]:
+    """World position (n, 3) of a point of a tag, and its Jacobians (n, 3, 6) by body and tag."""
+    in_body = move(tag, points)
+    world = move(body, in_body)[:, 0]
+    identity = np.broadcast_to(np.eye(3), (len(points), 3, 3))
+    by_body = body[:, :3, :3] @ np.concatenate([-se3.skew(in_body[:, 0]), identity], -1)
+    by_tag = body[:, :3, :3] @ tag[:, :3, :3] @ np.concatenate([-se3.skew(points[:, 0]), identity], -1)
+    return world, (by_body, by_tag)
+
+
+def move(poses: Float[Array, "m 4 4"], points: Float[Array, "m k 3"]) -> Float[Array, "m k 3"]:
+    """Points of each pose's source frame, moved."""
+    return points @ np.swapaxes(poses[:, :3, :3], -1, -2) + poses[:, None, :3, 3]
