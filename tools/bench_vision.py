@@ -134,9 +134,8 @@ def bench(session: Session, folder: Path, seen: list[Seen], tracker: str) -> Non
         track = found.track if isinstance(found, TossTrack) else found
         full.append(found)
         errors.append(judged(track.camera_from_object, toss.truth, None, points))
-        print(
-            f"  {folder.name} toss {toss.number} {tracker}: {line(errors[-1], toss.moving)} lost {int(track.lost.sum())}"
-        )
+        lost = int(track.lost.sum())
+        print(f"  {folder.name} toss {toss.number} {tracker}: {line(errors[-1], toss.moving)} lost {lost}")
     moving = np.concatenate([t.moving for t in seen])
     print(f"{folder.name} {tracker}: {line(joined(errors), moving)}, {1000 * cpu_s / frames:.0f} CPU-ms a frame")
     tracks = [f for f in full if isinstance(f, TossTrack)]

@@ -41,7 +41,7 @@ class GraphConfig:
     """The last row weighs looks more: they err by a tenth of a pixel, and whole patches of depth err together."""
     sure_cost: float = 0.08
     """A pair that fits worse counts less."""
-    spin_change_rad_s: float = 0.7
+    spin_change_rad_s: float = 0.5
     """Standard deviation of the change of spin between frames in flight (not an impact)."""
     velocity_change_m_s: float = 0.06
     """... and of the velocity beyond gravity's share."""
