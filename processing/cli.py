@@ -9,14 +9,13 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from processing.variants import CONTACT_ONLY, NAMES, default_name, find_variant
+from processing.variants import CONTACT_ONLY, NAMES, TRACKERS, default_name, find_variant
 from recordings.console import Outcome, Parser, command_parser, progress_for, run_command
 from recordings.errors import BadInput, TosslabError
 
 if TYPE_CHECKING:
     from recordings.session import Session
 
-TRACKERS = ("frame-to-model",)
 SAMPLE = "sample"
 SAMPLE_FOLDER = Path("samples") / "box_toss"
 CONTACT = "processing.contact.command"
@@ -46,7 +45,7 @@ def _parser() -> Parser:
     )
     parser.add_argument("--truth", metavar="DIR", type=Path, help="truth/ or a *_truth folder, opened for scores only")
     parser.add_argument("--model", metavar="RESULTS", type=Path, help="track with a shape that was learned before")
-    parser.add_argument("--tracker", metavar="NAME", default="frame-to-model", help=f"one of: {', '.join(TRACKERS)}")
+    parser.add_argument("--tracker", metavar="NAME", default=TRACKERS[0], help=f"one of: {', '.join(TRACKERS)}")
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="cpu (default) or cuda")
     if find_spec(CONTACT):
         import_module(CONTACT).add_arguments(parser)
@@ -75,7 +74,14 @@ def _refuse_what_is_not_there(args: argparse.Namespace) -> None:
     if args.model is not None:
         raise BadInput("--model needs the tracker that uses a learned shape: not there yet; run without --model")
     if args.device == "cuda":
-        raise BadInput(f"--device cuda: the tracker {args.tracker} runs on the CPU only; run without --device")
+        _refuse_missing_gpu()
+
+
+def _refuse_missing_gpu() -> None:
+    import torch
+
+    if not torch.cuda.is_available():
+        raise BadInput("--device cuda: torch finds no CUDA device here; run with --device cpu")
 
 
 def _session_path(given: str) -> Path:
@@ -119,7 +125,7 @@ def _vision(args: argparse.Namespace, session: Session, name: str, out: Path) ->
     from processing.pipeline import process, start_run
 
     tosses = chosen_tosses(args.toss, session.tosses)
-    run = start_run(session, tosses, out, Config(), args.tracker, progress_for)
+    run = start_run(session, tosses, out, Config(), args.tracker, progress_for, args.device)
     process(run, find_variant(name), args.scope)
     return _evaluate(args, session, out)  # the door to truth is opened after every track and shape is written
 

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from processing.field.learn import LearnConfig
 from processing.segment.background import BackgroundSettings
 from processing.segment.static_scene import SceneSettings
 from processing.track.frame_to_model import FrameToModelSettings
+from processing.track.register import RegisterConfig
+from processing.track.sequence import TrackConfig
 
 
 @dataclass(frozen=True)
@@ -15,4 +18,7 @@ class Config:
 
     scene: SceneSettings = field(default_factory=SceneSettings)
     masks: BackgroundSettings = field(default_factory=BackgroundSettings)
+    track: TrackConfig = field(default_factory=TrackConfig)
+    register: RegisterConfig = field(default_factory=RegisterConfig)
+    shape: LearnConfig = field(default_factory=LearnConfig)
     frame_to_model: FrameToModelSettings = field(default_factory=FrameToModelSettings)

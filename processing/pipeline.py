@@ -20,7 +20,8 @@ from processing.segment.segmenter import Example
 from processing.segment.static_scene import StaticScene, calibrated_table_depth, learn_scene, sample_positions
 from processing.stage import Counts, Done, Store, locked
 from processing.track.frame_to_model import FrameToModel
-from processing.variants import Variant
+from processing.variants import TRACKERS, Variant
+from processing.vision import field_stage, register_stage, track_stage
 from recordings.errors import BadInput
 from recordings.progress import Progress
 from recordings.records import RgbdFrame
@@ -50,12 +51,19 @@ class Run:
     store: Store
     config: Config
     tracker: str
+    device: str
     progress: MakeProgress
     keys: Mapping[str, str]
 
 
 def start_run(
-    session: Session, tosses: Sequence[int], results: Path, config: Config, tracker: str, progress: MakeProgress
+    session: Session,
+    tosses: Sequence[int],
+    results: Path,
+    config: Config,
+    tracker: str,
+    progress: MakeProgress,
+    device: str = "cpu",
 ) -> Run:
     """Check what the run needs and take the fingerprints of its inputs. Raises BadInput."""
     if not tosses:
@@ -68,17 +76,19 @@ def start_run(
     keys = {f"toss_{t:02d}": file_sha256(session.file(t)) for t in tosses}
     calibration = json.dumps(session.calibration.to_json(), sort_keys=True).encode()
     keys["calibration"] = hashlib.sha256(calibration).hexdigest()
-    return Run(session, tuple(tosses), Store(results), config, tracker, progress, keys)
+    return Run(session, tuple(tosses), Store(results), config, tracker, device, progress, keys)
 
 
 def process(run: Run, variant: Variant, scope: Scope) -> VariantRecord:
     """Tracks and shapes of one variant, and the record of where they are."""
     scene = static_scene(run)
-    tosses = []
-    for toss in run.tosses:
-        masks = object_masks(run, toss, scene)
-        once = first_pass(run, toss, masks)  # p_i, O_i
-        tosses.append(TossRecord(toss, once.name, once.name, masks.name))
+    masks = {t: object_masks(run, t, scene) for t in run.tosses}
+    once = {t: first_pass(run, t, masks[t]) for t in run.tosses}  # p_i
+    if variant.poses_from == "all_tosses":
+        tracks, shapes, notes = _all_together(run, once, masks)  # P, O
+    else:
+        tracks, shapes, notes = once, _alone(run, once, masks, scope), ["each toss has its own object frame"]
+    tosses = [TossRecord(t, tracks[t].name, shapes[t].name, masks[t].name) for t in run.tosses]
     record = VariantRecord(
         name=variant.name,
         scope=scope,
@@ -88,14 +98,41 @@ def process(run: Run, variant: Variant, scope: Scope) -> VariantRecord:
         calibration=run.session.calibration,
         tosses=tuple(tosses),
         shape=tosses[0].shape if scope == "all" else None,
-        shared_object_frame=False,
+        shared_object_frame=variant.poses_from == "all_tosses",
         session_path=os.path.relpath(run.session.path.resolve(), run.store.results.resolve()),
-        notes=(f"tracker: {run.tracker}", "each toss has its own object frame"),
+        notes=(f"tracker: {run.tracker}", *notes),
         extra={"tracker": run.tracker},
     )
     with locked(run.store.results / ".variants.lock"):
         write_variant(run.store.results, record)
     return record
+
+
+def _alone(run: Run, once: Mapping[int, Done], masks: Mapping[int, Done], scope: Scope) -> dict[int, Done]:
+    """O_i: in scope all only the first toss's shape is looked at."""
+    if run.tracker == FrameToModel.name:
+        return dict(once)
+    wanted = run.tosses if scope == "one" else run.tosses[:1]
+    shapes = {t: field_stage(run, f"toss {t}", {t: once[t]}, {t: masks[t]}) for t in wanted}
+    return {t: shapes.get(t, shapes[wanted[0]]) for t in run.tosses}
+
+
+def _all_together(
+    run: Run, once: Mapping[int, Done], masks: Mapping[int, Done]
+) -> tuple[dict[int, Done], dict[int, Done], list[str]]:
+    """P, O: all tosses in one object frame, and one shape."""
+    if run.tracker == FrameToModel.name:
+        raise BadInput(
+            f"--tracker {run.tracker} has no registration between tosses, so no bundlesdf-10; "
+            f"take --tracker {TRACKERS[0]}, or --variant bundlesdf-1"
+        )
+    together = register_stage(run, dict(once), dict(masks))
+    tracks = dict.fromkeys(run.tosses, together)
+    left_out = together.counts["not_joined"]
+    notes = [f"tosses {left_out} could not be brought into the object frame of the others: lost"] if left_out else []
+    joined = [t for t in run.tosses if t not in left_out]
+    shape = field_stage(run, "all tosses", dict.fromkeys(joined, together), {t: masks[t] for t in joined})
+    return tracks, dict.fromkeys(run.tosses, shape), notes
 
 
 def static_scene(run: Run) -> Done:
@@ -156,7 +193,9 @@ def _example(run: Run, toss: int) -> Example:
 
 
 def first_pass(run: Run, toss: int, masks: Done) -> Done:
-    """Stage `track`: poses and shape from one toss alone."""
+    """Stage `track` by the chosen tracker. The baseline's folder holds its shape too."""
+    if run.tracker != FrameToModel.name:
+        return track_stage(run, toss, masks)
     name = f"toss_{toss:02d}"
     inputs = {"masks": masks.key, name: run.keys[name], "calibration": run.keys["calibration"]}
 

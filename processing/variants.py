@@ -8,6 +8,8 @@ from typing import Literal
 from recordings.errors import BadInput
 
 From = Literal["one_toss", "all_tosses"]
+TRACKERS = ("multi-hypothesis", "frame-to-model")
+"""Names for --tracker, the default first; the second is what users have today, kept as the baseline."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +75,7 @@ CONTACT_ONLY = "contact-only"
 """Contact learning on poses that were recorded or imported, without vision."""
 NAMES = (*(v.name for v in TABLE), *BEYOND, CONTACT_ONLY, "table")
 
-EXISTING = frozenset({"first pass on one toss"})
+EXISTING = frozenset({"first pass on one toss", "first pass on all tosses together"})
 """Stages that the pipeline has so far."""
 
 

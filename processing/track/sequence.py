@@ -91,7 +91,7 @@ def track_toss(
     """
     config, progress = config or TrackConfig(), progress or Silent()
     sure = np.ones(len(frames)) if confidence is None else np.asarray(confidence, dtype=np.float64)
-    store, times_s = _views(frames, masks, camera, sure, config, world_from_camera, progress)
+    store, times_s = views_of(frames, masks, camera, sure, config, world_from_camera, progress)
     first = next((i for i in range(len(frames)) if store.usable(i)), None)
     if first is None:
         raise BadInput(
@@ -105,7 +105,7 @@ def track_toss(
     return _refined(scene, best, first, margin, rejected, config, toss, camera.frame, object_frame, frames)
 
 
-def _views(
+def views_of(
     frames: Sequence[RgbdFrame], masks: Sequence[Bool[Array, "h w"]], camera: CameraModel, sure: Float[Array, " n"],
     config: TrackConfig, world_from_camera: Transform | None, progress: Progress,
 ) -> tuple[ViewStore, Float[Array, " n"]]:  # fmt: skip

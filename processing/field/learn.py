@@ -1,0 +1,77 @@
+"""The field of an object from its tracks: which frames are looked at, and the shape that comes out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Bool, Float, Int64
+from numpy import ndarray as Array
+from scipy.spatial.transform import Rotation, Slerp
+
+from processing.field.mesh import extract_mesh
+from processing.field.train import FieldConfig, train_field
+from processing.field.views import FieldView, make_view
+from recordings.errors import BadInput
+from recordings.geometry import CameraModel
+from recordings.progress import Progress
+from recordings.records import RgbdFrame
+from recordings.tracks import ObjectShape, ObjectTrack
+
+
+@dataclass(frozen=True)
+class LearnConfig:
+    most_views: int = 160
+    """Frames looked at, spread evenly over all tosses: more cost time and add nothing to the surface."""
+    field: FieldConfig = field(default_factory=FieldConfig)
+
+
+@dataclass(frozen=True, eq=False)
+class TossViews:
+    """One toss as the field sees it: frames are read when they are chosen."""
+
+    frames: Sequence[RgbdFrame]
+    depth_times_ns: Int64[Array, " n"]
+    masks: Sequence[Bool[Array, "h w"]]
+    track: ObjectTrack
+
+
+def learn_shape(
+    tosses: Sequence[TossViews], camera: CameraModel, config: LearnConfig, device: str, progress: Progress
+) -> tuple[ObjectShape, int]:
+    """The shape of an object in the frame that all tracks share, and how many views it was learned from.
+
+    Raises BadInput where no tracked frame shows the object.
+    """
+    places = [(t, i) for t in tosses for i in range(len(t.track.status)) if t.track.status[i] == "tracked"]
+    chosen = (
+        [places[i] for i in np.unique(np.linspace(0, len(places) - 1, config.most_views).astype(int))] if places else []
+    )
+    views = [view for toss, i in chosen if (view := _view(toss, i, camera)) is not None]
+    if not views:
+        raise BadInput("no tracked frame shows the object, so there is nothing to learn a shape from")
+    trained = train_field(views, config.field, device, progress)
+    frame = tosses[0].track.object_frame
+    return extract_mesh(trained.field, trained.grid, frame, "neural field"), len(views)
+
+
+def _view(toss: TossViews, position: int, camera: CameraModel) -> FieldView | None:
+    pose = toss.track.camera_from_object[position]
+    at_depth = pose_at(toss.track, position, int(toss.depth_times_ns[position]))
+    return make_view(toss.frames[position], toss.masks[position], camera, pose, at_depth)
+
+
+def pose_at(track: ObjectTrack, position: int, time_ns: int) -> Float[Array, "4 4"]:
+    """`camera_from_object` at a time near a frame's: moved along the way to the neighbour on that side, if tracked."""
+    here = track.camera_from_object[position]
+    other = position + (1 if time_ns > track.time_ns[position] else -1)
+    if time_ns == track.time_ns[position] or not 0 <= other < len(track.status) or track.status[other] == "lost":
+        return here
+    there = track.camera_from_object[other]
+    share = (time_ns - int(track.time_ns[position])) / int(track.time_ns[other] - track.time_ns[position])
+    out = np.eye(4)
+    turns = Slerp([0.0, 1.0], Rotation.from_matrix(np.stack([here[:3, :3], there[:3, :3]])))
+    out[:3, :3] = turns(min(share, 1.0)).as_matrix()
+    out[:3, 3] = (1 - share) * here[:3, 3] + share * there[:3, 3]
+    return out

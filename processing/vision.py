@@ -1,0 +1,109 @@
+"""The vision stages of the pipeline: tracks of one toss, tosses in one object frame, the field and its shape."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from processing.field.learn import LearnConfig, TossViews, learn_shape
+from processing.stage import Counts, Done
+from processing.track.multi_hypothesis import read_toss_track, write_toss_track
+from processing.track.register import register_tosses
+from processing.track.sequence import track_toss
+from recordings.results import read_masks, read_track, write_shape, write_track
+from recordings.tracks import ObjectTrack, Status
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from processing.pipeline import Run
+
+CAMERA = "d455"
+
+
+def track_stage(run: Run, toss: int, masks: Done) -> Done:
+    """Stage `track`: p_i, the poses of one toss from that toss alone."""
+    name = f"toss_{toss:02d}"
+    inputs = {"masks": masks.key, name: run.keys[name], "calibration": run.keys["calibration"]}
+
+    def compute(folder: Path) -> Counts:
+        frames = run.session.toss(toss).rgbd(CAMERA)
+        seen = read_masks(masks.folder, toss)
+        tracked = track_toss(
+            frames,
+            seen,
+            run.session.calibration.camera(CAMERA),
+            run.config.track,
+            run.progress(f"toss {toss}: poses"),
+            toss=toss,
+            object_frame=f"object_{name}",
+            confidence=seen.confidence,
+            world_from_camera=run.session.calibration.find("world", CAMERA),
+        )
+        write_toss_track(folder, tracked)
+        return _count(tracked.track)
+
+    return run.store.run("track", 2, run.config.track, inputs, compute)
+
+
+def register_stage(run: Run, tracks: dict[int, Done], masks: dict[int, Done]) -> Done:
+    """Stage `register`: P, the poses of all tosses in one object frame, refined together.
+
+    A toss that cannot be brought into that frame is lost in P, frame by frame, and counted.
+    """
+    inputs = {f"track_{t:02d}": tracks[t].key for t in run.tosses}
+
+    def compute(folder: Path) -> Counts:
+        camera = run.session.calibration.camera(CAMERA)
+        world = run.session.calibration.find("world", CAMERA)
+        tosses = []
+        for toss in run.tosses:
+            frames, seen = run.session.toss(toss).rgbd(CAMERA), read_masks(masks[toss].folder, toss)
+            tosses.append(
+                read_toss_track(
+                    tracks[toss].folder, toss, frames, seen, camera, seen.confidence, run.config.track, world
+                )
+            )
+        together = register_tosses(tosses, run.config.register, run.progress("one object frame"))
+        counts = {"not_joined": [t for t, joined in zip(run.tosses, together.joined, strict=True) if not joined]}
+        for track, joined in zip(together.tracks, together.joined, strict=True):
+            write_track(folder, replace(track if joined else lost_track(track), object_frame="object"))
+        return {**counts, "fit": [round(float(f), 4) if np.isfinite(f) else None for f in together.fit]}
+
+    return run.store.run("register", 1, run.config.register, inputs, compute)
+
+
+def field_stage(run: Run, name: str, tracks: dict[int, Done], masks: dict[int, Done]) -> Done:
+    """Stage `field`: the shape that the tracked frames of these tosses show, in the frame that their tracks share."""
+    inputs = {"for": name}
+    for toss in tracks:
+        inputs |= {f"track_{toss:02d}": tracks[toss].key, f"masks_{toss:02d}": masks[toss].key}
+    config: LearnConfig = run.config.shape
+
+    def compute(folder: Path) -> Counts:
+        views = []
+        for toss, track in tracks.items():
+            frames = run.session.toss(toss).rgbd(CAMERA)
+            seen = read_masks(masks[toss].folder, toss)
+            views.append(TossViews(frames, frames.depth_times_ns, seen, read_track(track.folder, toss)))
+        camera = run.session.calibration.camera(CAMERA)
+        shape, used = learn_shape(views, camera, config, run.device, run.progress(f"{name}: shape"))
+        write_shape(folder, shape)
+        unseen = 0.0 if shape.observed is None else float((~shape.observed).mean())
+        return {"views": used, "vertices": len(shape.vertices_m), "unobserved_share": round(unseen, 4)}
+
+    return run.store.run("field", 1, config, inputs, compute)
+
+
+def lost_track(track: ObjectTrack) -> ObjectTrack:
+    """The same frames, all lost: a pose in another object frame is no pose in this one."""
+    n = len(track.status)
+    status: tuple[Status, ...] = tuple("lost" for _ in range(n))
+    nowhere = np.full((n, 4, 4), np.nan)
+    return replace(track, camera_from_object=nowhere, status=status, covariance=np.full((n, 6, 6), np.nan))
+
+
+def _count(track: ObjectTrack) -> Counts:
+    return {"frames": len(track.status), **{kind: track.status.count(kind) for kind in ("interpolated", "lost")}}
