@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 
 from processing.contact.command import STAGE, VERSION, PoseSource
 from processing.contact.data_checks import duplicate_groups, refuse_leaks
@@ -50,6 +51,7 @@ def run_stage(
     began: float,
 ) -> tuple[dict[str, Any], str]:
     """Learn and roll out, or read what an equal run made. Returns the document and lines to read."""
+    torch.set_num_threads(1)  # the batches are small: more threads only wait for each other, and cost CPU seconds
     tracks = {t.toss: t for t in source.tracks}
     missing = [t for t in (*learned, *tested) if t not in tracks]
     learned, tested = [t for t in learned if t in tracks], [t for t in tested if t in tracks]
