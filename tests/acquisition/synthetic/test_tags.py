@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import json
+import subprocess
+import sys
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 import pytest
@@ -10,15 +15,45 @@ from acquisition.synthetic import textures
 from acquisition.synthetic.board import board_pose, board_tags
 from acquisition.synthetic.rays import Placed
 
-pupil_apriltags = pytest.importorskip("pupil_apriltags")
+pytest.importorskip("pupil_apriltags")
 PUPIL_SHIFT_PX = 0.5
 """pupil-apriltags' pixel centres lie at half integers, OpenCV's at integers."""
 
 
-@pytest.fixture(scope="session")
-def detector():
-    """One for the whole run: pupil-apriltags corrupts the heap when detectors that saw busy images are destroyed."""
-    return pupil_apriltags.Detector(families="tag36h11", quad_decimate=1.0)
+# Speaks before it lets the detector go, and leaves without tidying up.
+DETECT = """
+import json, os, sys
+import numpy as np
+from pupil_apriltags import Detector
+found = Detector(families="tag36h11", quad_decimate=1.0).detect
+image = np.load(sys.argv[1])
+print(json.dumps([[t.tag_id, t.hamming, t.corners.tolist()] for t in found(image)]), flush=True)
+os._exit(0)
+"""
+
+
+@dataclass(frozen=True)
+class Found:
+    tag_id: int
+    hamming: int
+    corners: np.ndarray
+
+
+class ApartDetector:
+    """pupil-apriltags in a process of its own: it corrupts the heap on busy images, and ours would die of it later."""
+
+    def __init__(self, scratch):
+        self._path = scratch / "image.npy"
+
+    def detect(self, image):
+        np.save(self._path, image)
+        done = subprocess.run([sys.executable, "-c", DETECT, self._path], capture_output=True, text=True, check=True)
+        return [Found(tag_id, hamming, np.array(corners)) for tag_id, hamming, corners in json.loads(done.stdout)]
+
+
+@pytest.fixture
+def detector(tmp_path):
+    return ApartDetector(tmp_path)
 
 
 def corner_errors(found, camera, tags):
