@@ -54,7 +54,7 @@ def _parser() -> Parser:
 
 
 def _work(args: argparse.Namespace) -> Outcome:
-    name = args.variant or default_name()
+    name = args.variant or (default_name() if args.tracker == TRACKERS[0] else "bundlesdf-1")
     if name != CONTACT_ONLY or not find_spec(CONTACT):
         find_variant(name)  # refuses by name, before anything is read
         _refuse_what_is_not_there(args)

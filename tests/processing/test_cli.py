@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from processing import pipeline
+from processing import vision
 from processing.cli import chosen_tosses, main
 from recordings.errors import BadInput
 from recordings.results import Results
@@ -52,9 +52,9 @@ def test_a_session_becomes_tracks_a_shape_a_table_and_a_report(
     session = record_tiny()
     code, out, _ = answers(capsys, session)
     assert code == 0
-    assert "bundlesdf-1" in out
+    assert "bundlesdf-10" in out
     results = Results.open(session)
-    assert results.variants() == (("bundlesdf-1", "all"),)
+    assert results.variants() == (("bundlesdf-10", "all"),)
     assert sorted(results.tracks()) == [0, 1]
     assert all(not t.lost.any() for t in results.tracks().values())
     assert len(results.shape().faces) > 100
@@ -94,7 +94,7 @@ def test_both_layouts_of_the_truth_give_the_same_scores(
     assert "first frame" in first["values"]["add_auc"]["aligned"]
     for name, value in first["values"].items():
         assert second["values"][name]["value"] == pytest.approx(value["value"], abs=1e-3), name
-    assert first["paper"]["add_auc"] == 58.08
+    assert first["paper"]["add_auc"] == 32.42
 
 
 def test_tracks_and_shapes_are_the_same_bytes_with_and_without_truth(
@@ -123,7 +123,7 @@ def test_the_truth_is_opened_after_every_track_is_written(
 
     monkeypatch.setattr(truth, "open_truth", watched)
     answers(capsys, session, "--out", out, "--truth", tiny_world.truth_folder(tmp_path / "t", tosses=(0,)))
-    assert opened == [["scene", "segment", "track", "variants"]]
+    assert opened == [["field", "register", "scene", "segment", "track", "variants"]]
 
 
 def test_an_interrupted_run_keeps_everything_and_resumes_to_the_same_bytes(
@@ -131,20 +131,20 @@ def test_an_interrupted_run_keeps_everything_and_resumes_to_the_same_bytes(
 ) -> None:
     session = record_tiny()
     answers(capsys, session, "--out", tmp_path / "whole")
-    real = pipeline.FrameToModel.track
+    real = vision.track_toss
 
-    def stopped_at_toss_1(self: Any, toss: int, *rest: Any) -> Any:
+    def stopped_at_toss_1(*rest: Any, toss: int, **more: Any) -> Any:
         if toss == 1:
             raise KeyboardInterrupt
-        return real(self, toss, *rest)
+        return real(*rest, toss=toss, **more)
 
-    monkeypatch.setattr(pipeline.FrameToModel, "track", stopped_at_toss_1)
+    monkeypatch.setattr(vision, "track_toss", stopped_at_toss_1)
     code, _, err = answers(capsys, session, "--out", tmp_path / "resumed")
     assert code == 130
     assert "everything so far is kept" in err
     assert len(list((tmp_path / "resumed").glob("track-*"))) == 1
     assert not list((tmp_path / "resumed").glob("*.partial"))
-    monkeypatch.setattr(pipeline.FrameToModel, "track", real)
+    monkeypatch.setattr(vision, "track_toss", real)
     kept = {p: p.stat().st_mtime_ns for p in (tmp_path / "resumed").glob("*/stage.json")}
     assert answers(capsys, session, "--out", tmp_path / "resumed")[0] == 0
     assert all(p.stat().st_mtime_ns == t for p, t in kept.items())
@@ -182,12 +182,22 @@ def test_only_the_chosen_tosses_are_processed(record_tiny: Record, capsys: pytes
     session = record_tiny(tosses=(0, 3))
     answers(capsys, session, "--toss", "3")
     assert list(Results.open(session).tracks()) == [3]
-    assert Results.open(session).shape().object_frame == "object_toss_03"
+    assert Results.open(session).shape().object_frame == "object"
+
+
+def test_the_baseline_gives_its_own_row(record_tiny: Record, capsys: pytest.CaptureFixture[str]) -> None:
+    session = record_tiny()
+    assert answers(capsys, session, "--tracker", "frame-to-model")[0] == 0
+    assert Results.open(session).variants() == (("bundlesdf-1", "all"),)
+    assert Results.open(session).shape().object_frame == "object_toss_00"
+    code, _, err = answers(capsys, session, "--tracker", "frame-to-model", "--variant", "bundlesdf-10")
+    assert code == 2
+    assert "no registration between tosses" in err
 
 
 def test_scope_one_gives_every_toss_its_own_shape(record_tiny: Record, capsys: pytest.CaptureFixture[str]) -> None:
     session = record_tiny()
-    answers(capsys, session, "--scope", "one")
+    answers(capsys, session, "--scope", "one", "--variant", "bundlesdf-1")
     results = Results.open(session)
     assert results.variants() == (("bundlesdf-1", "one"),)
     frames = [results.shape(toss=t).object_frame for t in (0, 1)]
@@ -229,12 +239,12 @@ def test_of_several_sessions_one_that_fails_does_not_stop_the_others(
         (["--variant", "ours"], "variant ours needs .* not there yet; available: bundlesdf-1"),
         (["--variant", "table"], "table needs all rows"),
         (["--variant", "bundlesdf"], "no variant 'bundlesdf'"),
-        (["--tracker", "icp"], "no tracker 'icp'; available: frame-to-model"),
+        (["--tracker", "icp"], "no tracker 'icp'; available: multi-hypothesis, frame-to-model"),
         (["--toss", "7"], "the session has the tosses 0, 1"),
         (["--toss", "1-"], "wanted a toss number or a range"),
         (["--scope", "both"], "invalid choice: 'both'"),
         (["--truth", "nowhere"], "nowhere is no truth: wanted toss_XX.mcap"),
-        (["--device", "cuda"], "runs on the CPU only"),
+        (["--device", "cuda"], "no CUDA device here"),
     ],
 )
 def test_bad_usage_is_refused_in_plain_words(
