@@ -104,9 +104,10 @@ def test_other_paths_are_left_alone(check, line):
     assert not list(check.hidden_machines("a.py", line))
 
 
-def test_long_files_need_a_reason_and_long_functions_have_none(check):
+def test_long_files_and_long_functions_need_a_reason_of_their_own(check):
     long_file = "x = 1\n" * 401
     assert len(list(check.too_long("a.py", long_file))) == 1
     assert not list(check.too_long("a.py", long_file + "# long because: one table\n"))
     long_function = "def f():\n" + "    x = 1\n" * 80
-    assert len(list(check.too_long("a.py", long_function + "# long because: no\n"))) == 1
+    assert len(list(check.too_long("a.py", long_function + "# long because: not in the function\n"))) == 1
+    assert not list(check.too_long("a.py", long_function + "    # long because: one compiled loop\n    x = 2\n"))

@@ -13,6 +13,8 @@ from typing import no_type_check
 import numpy as np
 from numba import njit
 
+# long because: the kernels share the layout of views and samples that is laid down here
+
 Z, NX, NY, NZ, OUTSIDE = range(5)
 LOOKS = 3
 """Brightness levelled against shading, and two differences of colour that shading leaves alone."""
@@ -44,6 +46,8 @@ ODD_COST = 0.4
 def fit_surface(depth_m, inside, rays, radius, edge_share, out_m, normals):  # noqa: C901 (one hot loop)
     """Local planes, fitted to inverse depth (in which planes stay planes) over a window, twice: the second time
     without what lies off the first plane. Fills small holes. Writes depth and normal, 0 where there is no plane."""
+    # long because: one compiled loop over pixels, its sums kept in registers
+    # long because: one hot loop over pixels whose sums live in registers
     h, w = depth_m.shape
     for v in range(h):
         for u in range(w):
@@ -132,6 +136,7 @@ def pair_terms(samples, step, pose, maps, row, focal, center, level, s_geo, s_in
     pose: 4x4 other_from_sample_camera. H (6, 6), g (6): J^T W J and J^T W r for a twist (translation, rotation) of the
     points in the other camera's frame. Returns cost sum, points counted, points on the surface, violations.
     """
+    # long because: one compiled loop over points, the tracker's innermost
     off, u0, v0, w, h = row[OFFSET], row[U0], row[V0], row[WIDTH], row[HEIGHT]
     fx, fy, cx, cy = focal[0], focal[1], center[0], center[1]
     cost = 0.0
