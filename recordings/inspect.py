@@ -79,7 +79,7 @@ class Info:
 
     def to_text(self) -> str:
         age = (
-            ""
+            ", age not said"
             if self.calibration_age_days is None
             else f", {_days(self.calibration_age_days)} old when it was recorded"
         )

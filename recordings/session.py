@@ -14,8 +14,15 @@ from numpy import ndarray as Array
 
 from recordings import arm_codec, codec, sync
 from recordings.align import align_depth
-from recordings.documents import FORMAT_VERSION, mapping, parse_document, parse_json, positive_number, whole_number
-from recordings.documents import read_document as read_document
+from recordings.documents import (
+    FORMAT_VERSION,
+    mapping,
+    parse_document,
+    parse_json,
+    positive_number,
+    read_document,
+    whole_number,
+)
 from recordings.errors import BadInput, DamagedFile
 from recordings.geometry import CameraModel
 from recordings.mcap_file import McapFile, Message

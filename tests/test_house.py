@@ -15,7 +15,7 @@ ROOT = Path(__file__).resolve().parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 COMMANDS = PROJECT["scripts"]
 HEAVY = ("open3d", "torch", "rerun", "mujoco", "numba", "rosbags", "pyrealsense2", "pinocchio", "pydrake", "pybullet",
-         "gtsam", "matplotlib", "trimesh", "skimage", "pyarrow", "pupil_apriltags")  # fmt: skip
+         "matplotlib", "trimesh", "skimage", "pyarrow", "pupil_apriltags")  # fmt: skip
 HELP_CPU_S = 0.5
 
 # Runs a command as its console script would, then says on the last line what it had imported.

@@ -16,7 +16,6 @@ from jaxtyping import Bool, Float, Float32, Int, UInt8
 from numpy import ndarray as Array
 from scipy.spatial import cKDTree
 
-from processing.track.tracker import Tracked
 from recordings.errors import BadInput
 from recordings.geometry import CameraModel, nearest_rotation, rotation_exp
 from recordings.progress import Progress
@@ -70,6 +69,14 @@ class _View:
         return 0.5 * (self.points_m.min(0) + self.points_m.max(0)) if len(self.points_m) < 10 else self.points_m.mean(0)
 
 
+@dataclass(frozen=True, eq=False)
+class Tracked:
+    """One toss's track and the shape in the object frame of that track."""
+
+    track: ObjectTrack
+    shape: ObjectShape
+
+
 class FrameToModel:
     """Tracker that aligns each frame to the model fused from the frames before it. See `Tracker`."""
 
@@ -87,7 +94,8 @@ class FrameToModel:
         object_frame: str,
         progress: Progress,
     ) -> Tracked:
-        """Poses of all frames and the fused mesh. See `Tracker.track`."""
+        """Poses `camera_from_object` of all frames, and the fused mesh. The object frame starts parallel to the
+        camera at the middle of the first masked cloud. Raises BadInput where no frame holds enough of the object."""
         s = self._settings
         poses = np.full((len(frames), 4, 4), np.nan)
         covariance = np.full((len(frames), 6, 6), np.nan)

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from processing.metrics import align_first, frame_errors
-from processing.track.frame_to_model import FrameToModel
-from processing.track.tracker import Tracked
+from processing.track.frame_to_model import FrameToModel, Tracked
 from recordings.errors import BadInput
 from recordings.geometry import CameraModel, rotation_angle_rad
 from recordings.progress import Silent
