@@ -8,29 +8,23 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from processing.config import Config
-from processing.segment.background import BackgroundSegmenter
-from processing.segment.segmenter import Example
-from processing.segment.static_scene import StaticScene, calibrated_table_depth, learn_scene, sample_positions
+from processing.masks import object_masks, static_scene
 from processing.stage import Counts, Done, Store, locked
 from processing.track.frame_to_model import FrameToModel
 from processing.variants import TRACKERS, Variant
-from processing.vision import field_stage, register_stage, track_stage
+from processing.vision import CAMERA, field_stage, register_stage, track_stage
 from recordings.errors import BadInput
 from recordings.progress import Progress
-from recordings.records import RgbdFrame
 from recordings.results import (
     Scope,
     TossRecord,
     VariantRecord,
     read_masks,
-    write_masks,
     write_shape,
     write_track,
     write_variant,
@@ -38,7 +32,6 @@ from recordings.results import (
 from recordings.session import Session
 from recordings.session_writer import file_sha256
 
-CAMERA = "d455"
 MakeProgress = Callable[[str], Progress]
 
 
@@ -133,63 +126,6 @@ def _all_together(
     joined = [t for t in run.tosses if t not in left_out]
     shape = field_stage(run, "all tosses", dict.fromkeys(joined, together), {t: masks[t] for t in joined})
     return tracks, dict.fromkeys(run.tosses, shape), notes
-
-
-def static_scene(run: Run) -> Done:
-    """Stage `scene`: what the camera sees without the object, from frames of all tosses of the run."""
-    inputs = {name: run.keys[name] for name in ("calibration", *(f"toss_{t:02d}" for t in run.tosses))}
-    return run.store.run("scene", 1, run.config.scene, inputs, lambda folder: _learn_scene(run, folder))
-
-
-def _learn_scene(run: Run, folder: Path) -> Counts:
-    streams = [run.session.toss(t).rgbd(CAMERA) for t in run.tosses]
-    chosen = sample_positions([len(s) for s in streams], run.config.scene.frames)
-    progress = run.progress("static scene")
-
-    def frames() -> Iterator[RgbdFrame]:
-        for done, (toss, position) in enumerate(chosen):
-            progress.step(done, len(chosen))
-            yield streams[toss][position]
-
-    scene = learn_scene(frames(), calibrated_table_depth(run.session.calibration, CAMERA), run.config.scene)
-    with open(folder / "scene.npz", "wb") as out:
-        np.savez(out, **vars(scene))
-    return {"frames": len(chosen), "pixels_with_depth": int((scene.depth_m > 0).sum())}
-
-
-def object_masks(run: Run, toss: int, scene: Done) -> Done:
-    """Stage `segment`: the object's mask in every frame of one toss."""
-    name = f"toss_{toss:02d}"
-    inputs = {"scene": scene.key, name: run.keys[name], "calibration": run.keys["calibration"]}
-    given = run.session.toss(toss).masks()
-    first = {i: given[i] for i in sorted(given)[:1]}
-    shown = None if first else _toss_with_mask(run)
-    if shown is not None:
-        inputs["example"] = run.keys[f"toss_{shown:02d}"]
-
-    def compute(folder: Path) -> Counts:
-        with np.load(scene.folder / "scene.npz", allow_pickle=False) as stored:
-            learned = StaticScene(**stored)
-        frames = run.session.toss(toss).rgbd(CAMERA)
-        segmenter = BackgroundSegmenter(learned, run.session.calibration.camera(CAMERA), run.config.masks)
-        example = None if shown is None else _example(run, shown)
-        progress = run.progress(f"toss {toss}: masks")
-        found = sorted(segmenter.masks(frames, first, example, None, progress), key=lambda m: m.position)
-        write_masks(folder, toss, [m.mask for m in found], np.array([m.confidence for m in found]))
-        empty = sum(not m.mask.any() for m in found)
-        return {"frames": len(found), "empty": empty, "given": len(first), "without_depth": len(frames.without_depth)}
-
-    return run.store.run("segment", 1, run.config.masks, inputs, compute)
-
-
-def _toss_with_mask(run: Run) -> int | None:
-    """The first toss that came with a mask: it shows what the object looks like."""
-    return next((t for t in run.tosses if run.session.toss(t).masks()), None)
-
-
-def _example(run: Run, toss: int) -> Example:
-    position, mask = min(run.session.toss(toss).masks().items())
-    return Example(run.session.toss(toss).rgbd(CAMERA)[position], mask)
 
 
 def first_pass(run: Run, toss: int, masks: Done) -> Done:
