@@ -1,0 +1,35 @@
+"""XMem's published checkpoint: where it comes from, its layers, and a network that carries it.
+
+The published file could not be reached from where this was written: that our network loads and runs it is shown with
+random weights of the same names and shapes only. `xmem_layers.txt` has those, a line a layer, with sizes in PyTorch's
+order (`-` for a single number).
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from processing.segment.xmem_network import XMemNetwork
+from processing.weights import WeightFile, check_layers, find_weights, read_weights
+
+XMEM = WeightFile(("XMem-s012.pth", "XMem.pth"), "release v1.0 of the GitHub project hkchengrex/XMem", 249)
+OPTION = "--segmenter xmem"
+COUNTERS = "num_batches_tracked"
+"""Layers of this name count training steps: files may leave them out, and they change nothing."""
+
+
+def published_layers() -> dict[str, tuple[int, ...]]:
+    """Shape of every layer of the published checkpoint by name."""
+    lines = Path(__file__).with_name("xmem_layers.txt").read_text(encoding="utf-8").splitlines()
+    return {name: () if size == "-" else tuple(map(int, size.split("x"))) for name, size in map(str.split, lines)}
+
+
+def load_network(folder: Path | None) -> XMemNetwork:
+    """The published network with the weights in a user's folder, ready to run. Raises BadInput."""
+    path = find_weights(XMEM, folder, OPTION)
+    stored = read_weights(path, XMEM)
+    wanted = {n: s for n, s in published_layers().items() if n in stored or not n.endswith(COUNTERS)}
+    check_layers(stored, wanted, path, XMEM)
+    network = XMemNetwork()
+    network.load_state_dict(stored, strict=False)  # all but counters are there: checked above
+    return network.eval()

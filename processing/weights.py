@@ -1,0 +1,81 @@
+"""Learned weights that a user brings: where they come from, whether they are there, whether they are the right ones.
+
+Nothing is ever downloaded. A file is read as tensors alone (`weights_only`); each layer has its name and shape checked.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import pickle
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from recordings.errors import BadInput
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+Shapes = Mapping[str, tuple[int, ...]]
+
+
+@dataclass(frozen=True)
+class WeightFile:
+    """A published file: the names under which it is looked for (the first one there is taken) and where it is from."""
+
+    names: tuple[str, ...]
+    source: str
+    megabytes: int
+
+    def __str__(self) -> str:
+        return f"{' or '.join(self.names)} (about {self.megabytes} MB) of {self.source}"
+
+
+def find_weights(file: WeightFile, folder: Path | None, option: str) -> Path:
+    """The file in the user's folder. `option` is what asked for it, as typed. Raises BadInput."""
+    if folder is None:
+        raise BadInput(
+            f"{option} needs learned weights and no --weights DIR was given; "
+            f"wanted: a folder that holds {file}. Get it there, then run with {option} --weights DIR"
+        )
+    if not folder.is_dir():
+        raise BadInput(f"--weights {folder}: there is no such folder; wanted: a folder that holds {file}")
+    for name in file.names:
+        if (folder / name).is_file():
+            return folder / name
+    there = ", ".join(sorted(p.name for p in folder.iterdir())[:8]) or "nothing"
+    raise BadInput(f"{option}: found {there} in {folder}; wanted: {file}. Put it there, under that name")
+
+
+def read_weights(path: Path, file: WeightFile, inside: str | None = None) -> dict[str, Tensor]:
+    """The tensors of a checkpoint by layer name, those under the key `inside` where there is one. Raises BadInput."""
+    import torch
+
+    try:
+        stored: Any = torch.load(path, map_location="cpu", weights_only=True)
+    except (pickle.UnpicklingError, RuntimeError, EOFError, OSError, ValueError, KeyError) as wrong:
+        reason = str(wrong).strip().splitlines() or [type(wrong).__name__]
+        raise BadInput(f"{path} is no readable checkpoint ({reason[0][:120]}); wanted: {file}. Get it again") from wrong
+    if isinstance(stored, Mapping) and inside is not None and inside in stored:
+        stored = stored[inside]
+    if not isinstance(stored, Mapping) or not all(isinstance(v, torch.Tensor) for v in stored.values()):
+        raise BadInput(f"{path} holds no tensors by layer name; wanted: {file}")
+    return {str(k): v for k, v in stored.items()}
+
+
+def check_layers(found: Mapping[str, Tensor], wanted: Shapes, path: Path, file: WeightFile) -> None:
+    """Refuse weights whose layers are not the wanted ones, by name and shape. Raises BadInput that shows some."""
+    shapes = {name: tuple(tensor.shape) for name, tensor in found.items()}
+    wrong = [f"no {name}" for name in wanted if name not in shapes]
+    wrong += [f"unknown {name}" for name in shapes if name not in wanted]
+    wrong += [f"{n} is {shapes[n]}, wanted {wanted[n]}" for n in wanted if n in shapes and shapes[n] != wanted[n]]
+    if wrong:
+        more = f" and {len(wrong) - 3} more" if len(wrong) > 3 else ""
+        raise BadInput(f"{path} holds other layers: {'; '.join(wrong[:3])}{more}; wanted: {file}")
+
+
+def fingerprint(path: Path) -> str:
+    """sha256 of a file, for the keys of stages that depend on it."""
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
