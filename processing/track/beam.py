@@ -82,9 +82,10 @@ class Scene:
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """Poses (n, 4, 4), NaN where not tracked yet or lost; views that serve as model; the sum of what they cost."""
+    """Poses, NaN where not tracked yet or lost (after the n frames, those of a known shape's drawn views); views that
+    serve as model; the sum of what they cost."""
 
-    poses: Float[Array, "n 4 4"]
+    poses: Float[Array, "v 4 4"]
     costs: Float[Array, " n"]
     on_surface: Float[Array, " n"]
     done: tuple[int, ...]
@@ -132,12 +133,11 @@ def rows(schedule: Schedule, distance_m: float) -> Float[Array, "r 6"]:
 def follow(
     scene: Scene,
     order: Int[Array, " m"],
-    start: Hypothesis,
+    beam: list[Hypothesis],
     config: BeamConfig,
     on_step: object = None,
 ) -> Followed:
-    """Track the views in `order` (forward or backward in time) from what `start` already holds."""
-    beam = [start]
+    """Track the views in `order` (forward or backward in time) from what the hypotheses in `beam` already hold."""
     rejected: dict[int, list[Candidate]] = {}
     for i in order:
         i = int(i)
@@ -224,11 +224,11 @@ def _differ(a: Hypothesis, b: Hypothesis, i: int, config: BeamConfig) -> bool:
 def _branches(scene: Scene, h: Hypothesis, i: int, config: BeamConfig) -> tuple[list[Candidate], list[Candidate]]:
     """Candidates of one hypothesis for frame i: those that may live on, best first, and the others."""
     starts = _usual_starts(scene, h, i)
-    found = _merged(_aligned_all(scene, h, i, starts, config) + _held(scene, h, i, starts, config), config)
+    found = merged(_aligned_all(scene, h, i, starts, config) + _held(scene, h, i, starts, config), config)
     if not found or found[0].fit > config.doubt:
-        found = _merged(found + _aligned_all(scene, h, i, _feature_starts(scene, h, i, config), config), config)
+        found = merged(found + _aligned_all(scene, h, i, _feature_starts(scene, h, i, config), config), config)
     if not found or found[0].fit > config.search:
-        found = _merged(found + _searched(scene, h, i, starts, config), config)
+        found = merged(found + _searched(scene, h, i, starts, config), config)
     if not found:
         nothing = Candidate(np.full((4, 4), np.nan), 1.0, 0.0, 0.0, "none")
         return [nothing], []
@@ -291,7 +291,7 @@ def _searched(
             turned[:3, 3] = middle - turned[:3, :3] @ scene.center_m
             tries.append(turned)
     tried = [_aligned(scene, h, i, t, config.grid, config, "grid") for t in tries]
-    rough = _merged([c for c in tried if c is not None], config)[:8]
+    rough = merged([c for c in tried if c is not None], config)[:8]
     return _refined(scene, h, i, rough, config)
 
 
@@ -299,12 +299,12 @@ def _aligned_all(
     scene: Scene, h: Hypothesis, i: int, starts: list[tuple[str, Float[Array, "4 4"]]], config: BeamConfig
 ) -> list[Candidate]:
     coarse = [_aligned(scene, h, i, pose, config.coarse, config, name) for name, pose in starts]
-    return _refined(scene, h, i, _merged([c for c in coarse if c is not None], config)[:4], config)
+    return _refined(scene, h, i, merged([c for c in coarse if c is not None], config)[:4], config)
 
 
 def _refined(scene: Scene, h: Hypothesis, i: int, rough: list[Candidate], config: BeamConfig) -> list[Candidate]:
     fine = [_aligned(scene, h, i, c.pose, config.fine, config, c.source) for c in rough]
-    return _merged([c for c in fine if c is not None], config)
+    return merged([c for c in fine if c is not None], config)
 
 
 def _held(
@@ -321,7 +321,7 @@ def _held(
     return [c for c in found if c is not None]
 
 
-def _merged(candidates: list[Candidate], config: BeamConfig) -> list[Candidate]:
+def merged(candidates: list[Candidate], config: BeamConfig) -> list[Candidate]:
     """Sorted by cost, without those that say the same as a better one."""
     kept: list[Candidate] = []
     for c in sorted(candidates, key=lambda c: c.cost):

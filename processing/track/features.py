@@ -98,6 +98,8 @@ def _tight(crop: Crop, rim: int = 4) -> tuple[Float[Array, "2"], Array, Array]:
     low, high = np.quantile(gray[crop.mask[area]], [0.02, 0.98])
     stretched = np.clip((gray - low) / max(high - low, 0.05), 0, 1) * 255
     grown = cv2.dilate(crop.mask[area].astype(np.uint8), np.ones((3, 3), np.uint8))
+    if crop.colorless is not None:
+        grown[cv2.dilate(crop.colorless[area].astype(np.uint8), np.ones((5, 5), np.uint8)) > 0] = 0
     return np.array([left, top], dtype=float), stretched.astype(np.uint8), grown
 
 

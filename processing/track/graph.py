@@ -114,6 +114,7 @@ def refine(
     """All poses in `use` at once; those in `fixed` stay. `poses` of other views are returned as they are."""
     poses = poses.copy()
     pairs = choose_pairs(poses, use, motion.toss, motion.center_m, config)
+    pairs = pairs[~fixed[pairs].all(1)]
     distance = float(np.median(np.linalg.norm(store.center_m[use], axis=1)))
     free = np.flatnonzero(use & ~fixed)
     place = np.full(len(poses), -1)

@@ -22,6 +22,8 @@ SHARP, SMOOTH, CHANNELS = 5, 5 + LOOKS, 5 + 2 * LOOKS
 """First channel of the sharp looks and of the smooth ones; channels in all."""
 HIDDEN = -1.0
 """OUTSIDE holds the distance to the mask in pixels (0 inside), or HIDDEN where something nearer may be in the way."""
+NO_LOOK = 100.0
+"""Looks of a pixel whose colour is not the object's (its depth comes from elsewhere); far beyond any real value."""
 
 OFFSET, U0, V0, WIDTH, HEIGHT, FIRST, COUNT = range(7)
 """Columns of the view table: first pixel, crop corner and size, first sample and number of samples."""
@@ -228,6 +230,11 @@ def pair_terms(samples, step, pose, maps, row, focal, center, level, s_geo, s_in
             ju, jv = int(np.floor(u)), int(np.floor(v))
             a, b = u - ju, v - jv
             q = off + jv * w + ju
+            ch = SHARP + level * LOOKS
+            foreign = max(max(maps[q, ch], maps[q + 1, ch]), max(maps[q + w, ch], maps[q + w + 1, ch]))
+            if max(foreign, p[SSHARP]) > 0.5 * NO_LOOK:
+                cost += 0.5 * COVERED_COST
+                continue
             for c in range(LOOKS):
                 ch = SHARP + level * LOOKS + c
                 i00, i10, i01, i11 = maps[q, ch], maps[q + 1, ch], maps[q + w, ch], maps[q + w + 1, ch]

@@ -110,3 +110,16 @@ def gravity_in_camera(world_from_camera: Float[Array, "4 4"] | None) -> Float[Ar
     if world_from_camera is None:
         return np.zeros(3)
     return world_from_camera[:3, :3].T @ np.array([0.0, 0.0, -GRAVITY_M_S2])
+
+
+def all_turns(count: int) -> Float[Array, "n 3 3"]:
+    """Rotations spread over all orientations: directions of the axis, and turns about it."""
+    about = max(4, round((count * 1.6) ** (1 / 3)))
+    axes = max(4, count // about)
+    n = np.arange(axes) + 0.5
+    height, around = 1 - 2 * n / axes, np.pi * (1 + 5**0.5) * n
+    out = []
+    for z, phi in zip(height, around):
+        tilt = rotation_exp(np.arccos(z) * np.array([-np.sin(phi), np.cos(phi), 0.0]))
+        out += [tilt @ rotation_exp(np.array([0, 0, 2 * np.pi * a / about])) for a in range(about)]
+    return np.array(out)

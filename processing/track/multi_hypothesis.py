@@ -44,7 +44,7 @@ def read_toss_track(
 ) -> TossTrack:
     """A toss's track as `track_toss` gave it, its views cut anew from the frames. The rejected candidates are gone."""
     track = read_track(folder, toss)
-    store, _ = views_of(frames, masks, camera, confidence, config, world_from_camera, Silent())
+    store, _, _ = views_of(frames, masks, camera, confidence, config, world_from_camera, Silent())
     try:
         with np.load(folder / f"toss_{toss:02d}.fit.npz", allow_pickle=False) as stored:
             return TossTrack(

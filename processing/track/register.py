@@ -20,12 +20,14 @@ from processing.track.beam import Schedule, rows
 from processing.track.features import FeatureMatcher, Features, RansacConfig, Sift, relative_motions
 from processing.track.graph import GraphConfig, Motion, refine
 from processing.track.keyframes import view_directions
+from processing.track.known_shape import ShapeConfig, middle_of, shape_views
+from processing.track.motion import all_turns
 from processing.track.sequence import TossTrack
 from processing.track.views import ViewStore
 from recordings.errors import BadInput
 from recordings.geometry import rotation_exp, rotation_log
 from recordings.progress import Progress, Silent
-from recordings.tracks import ObjectTrack
+from recordings.tracks import ObjectShape, ObjectTrack
 
 
 @dataclass(frozen=True)
@@ -48,6 +50,7 @@ class RegisterConfig:
     fine: Schedule = ((0, 6, 0.004, 0.3, 0.006, 0.5), (0, 6, 0.003, 0.15, 0.005, 1.0))
     ransac: RansacConfig = field(default_factory=lambda: RansacConfig(trials=200, least=6))
     joint: GraphConfig = field(default_factory=lambda: GraphConfig(loops=10, neighbours=1))
+    shape: ShapeConfig = field(default_factory=ShapeConfig)
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,8 +80,11 @@ def register_tosses(
     config: RegisterConfig | None = None,
     progress: Progress | None = None,
     matcher: FeatureMatcher | None = None,
+    *,
+    model: ObjectShape | None = None,
 ) -> Registered:
-    """Tracks of several tosses of one object in one object frame, that of the first; jointly refined.
+    """Tracks of several tosses (or one) of one object in one object frame, jointly refined: that of the first toss, or
+    that of a learned shape, into which every toss is then placed by its form and colours (`first` means the shape).
 
     Raises BadInput where there is no toss, or the tosses are of different cameras.
     """
@@ -87,12 +93,13 @@ def register_tosses(
         raise BadInput("no toss to register; wanted at least one track")
     if len({t.track.camera for t in tosses}) > 1:
         raise BadInput(f"tracks of several cameras ({sorted({t.track.camera for t in tosses})}); wanted one camera")
-    pool = _pooled(tosses, config)
-    first_from_own = np.tile(np.eye(4), (len(tosses), 1, 1))
-    fit = np.full(len(tosses), np.nan)
-    fit[0] = 0.0
+    pool = _pooled(tosses, model, config)
+    root = 0 if model is None else len(tosses)
+    first_from_own = np.tile(np.eye(4), (max(len(tosses), root + 1), 1, 1))
+    fit = np.full(len(first_from_own), np.nan)
+    fit[root] = 0.0
     features: dict[int, Features] = {}
-    waiting = list(range(1, len(tosses)))
+    waiting = [t for t in range(len(tosses)) if t != root]
     rounds = 0
     while waiting and rounds < 2:  # a toss that does not fit now may fit when more of the object is known
         for t in list(waiting):
@@ -103,18 +110,31 @@ def register_tosses(
                 waiting.remove(t)
             progress.step(len(tosses) - len(waiting), len(tosses), f"toss {tosses[t].track.toss}")
         rounds += 1
-    poses = _refined(pool, np.isfinite(fit), first_from_own, config)
-    tracks = [_moved_track(tosses[t], pool, t, poses, first_from_own[t], bool(np.isfinite(fit[t]))) for t in
-              range(len(tosses))]  # fmt: skip
+    fixed = pool.toss == root
+    if model is None:
+        fixed[1:] = False
+    poses = _refined(pool, np.isfinite(fit), first_from_own, fixed, config)
+    fit, first_from_own = fit[: len(tosses)], first_from_own[: len(tosses)]
+    tracks = [_moved_track(toss, pool, t, poses, bool(np.isfinite(fit[t]))) for t, toss in enumerate(tosses)]
     return Registered(tuple(tracks), tuple(bool(f) for f in np.isfinite(fit)), fit, first_from_own)
 
 
-def _pooled(tosses: Sequence[TossTrack], config: RegisterConfig) -> _Pool:
+def _pooled(tosses: Sequence[TossTrack], model: ObjectShape | None, config: RegisterConfig) -> _Pool:
+    """The tosses' keyframes; after them the drawn views of a learned shape, as if they were one more toss."""
     chosen = [_spread(t, config.keyframes) for t in tosses]
-    store = ViewStore.joined([t.store.only(c) for t, c in zip(tosses, chosen)])
-    poses = np.concatenate([t.track.camera_from_object[c] for t, c in zip(tosses, chosen)])
+    stores = [t.store.only(c) for t, c in zip(tosses, chosen)]
+    poses = [t.track.camera_from_object[c] for t, c in zip(tosses, chosen)]
+    center_m = tosses[0].center_m
+    if model is not None:
+        drawn = shape_views(model, [c for s in stores for c in s.crops], stores[0].optics, config.shape)
+        stores.append(ViewStore(stores[0].optics, list(drawn.crops), stores[0].config))
+        for i in range(len(drawn.crops)):
+            stores[-1].fill(i)
+        poses.append(drawn.poses)
+        chosen.append(np.arange(len(drawn.crops)))
+        center_m = middle_of(model)
     whose = np.concatenate([np.full(len(c), i) for i, c in enumerate(chosen)])
-    return _Pool(store, poses, whose, np.concatenate(chosen), tosses[0].center_m)
+    return _Pool(ViewStore.joined(stores), np.concatenate(poses), whose, np.concatenate(chosen), center_m)
 
 
 def _spread(toss: TossTrack, count: int) -> Int[Array, " m"]:
@@ -201,19 +221,6 @@ def _by_grid(
     return [s[0][0] for s in scored[: config.tried // 2]]
 
 
-def all_turns(count: int) -> Float[Array, "n 3 3"]:
-    """Rotations spread over all orientations: directions of the axis, and turns about it."""
-    about = max(4, round((count * 1.6) ** (1 / 3)))
-    axes = max(4, count // about)
-    n = np.arange(axes) + 0.5
-    height, around = 1 - 2 * n / axes, np.pi * (1 + 5**0.5) * n
-    out = []
-    for z, phi in zip(height, around):
-        tilt = rotation_exp(np.arccos(z) * np.array([-np.sin(phi), np.cos(phi), 0.0]))
-        out += [tilt @ rotation_exp(np.array([0, 0, 2 * np.pi * a / about])) for a in range(about)]
-    return np.array(out)
-
-
 def _middle(pool: _Pool, views: Int[Array, " a"], poses: Float[Array, "n 4 4"]) -> Float[Array, "3"]:
     """Middle of the surface seen by several views, object frame."""
     seen = []
@@ -280,13 +287,13 @@ def _facing_pairs(
 
 
 def _refined(
-    pool: _Pool, joined: Bool[Array, " t"], first_from_own: Float[Array, "t 4 4"], config: RegisterConfig
-) -> Float[Array, "n 4 4"]:
-    """All keyframes of all joined tosses at once, the first toss's first keyframe fixed; poses in the first's frame."""
+    pool: _Pool, joined: Bool[Array, " t"], first_from_own: Float[Array, "t 4 4"], fixed: Bool[Array, " n"],
+    config: RegisterConfig,
+) -> Float[Array, "n 4 4"]:  # fmt: skip
+    """All keyframes of all joined tosses at once (the first toss's first one is fixed, or a learned shape's views);
+    poses in the common frame."""
     poses = np.array([p @ np.linalg.inv(first_from_own[t]) for p, t in zip(pool.poses, pool.toss)])
     use = joined[pool.toss]
-    fixed = np.zeros(len(poses), dtype=bool)
-    fixed[0] = True
     none = np.zeros(len(poses), dtype=bool)
     # keyframes are far apart in time: the pull towards free flight says nothing between them
     motion = Motion(pool.frame.astype(np.float64), np.arange(len(poses)), np.zeros(3), pool.center_m, none)
@@ -295,8 +302,7 @@ def _refined(
 
 
 def _moved_track(
-    toss: TossTrack, pool: _Pool, t: int, poses: Float[Array, "n 4 4"], first_from_own: Float[Array, "4 4"],
-    joined: bool,
+    toss: TossTrack, pool: _Pool, t: int, poses: Float[Array, "n 4 4"], joined: bool,
 ) -> ObjectTrack:  # fmt: skip
     """The toss's track in the common frame: each frame moved by the mean correction of the keyframes around it."""
     track = toss.track

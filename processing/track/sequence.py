@@ -14,18 +14,21 @@ from numpy import ndarray as Array
 
 from processing.track import kernels as k
 from processing.track.beam import LEAST_DELAY_S, BeamConfig, Candidate, Hypothesis, Scene, follow, started
+from processing.track.delay import put_at_color_times
+from processing.track.exposure import Exposure
 from processing.track.features import FeatureMatcher, Sift
-from processing.track.graph import GraphConfig, Motion, flight_center, motion_residual, refine
-from processing.track.motion import between, gravity_in_camera
-from processing.track.views import Crop, Exposure, Optics, ViewConfig, ViewStore, cut
+from processing.track.flags import FlagConfig, flagged, per_view
+from processing.track.graph import GraphConfig, Motion, refine
+from processing.track.keyframes import is_new
+from processing.track.known_shape import ShapeConfig, ShapeViews, located, middle_of, shape_views
+from processing.track.middle import center_of_mass
+from processing.track.motion import gravity_in_camera
+from processing.track.views import Crop, Optics, ViewConfig, ViewStore, cut
 from recordings.errors import BadInput
 from recordings.geometry import CameraModel, Transform
 from recordings.progress import Progress, Silent
 from recordings.records import RgbdFrame
-from recordings.tracks import ObjectTrack, Status
-
-IMPACT_M_S = 0.35
-"""A change of velocity around a frame beyond this is an impact."""
+from recordings.tracks import ObjectShape, ObjectTrack
 
 
 @dataclass(frozen=True)
@@ -35,15 +38,10 @@ class TrackConfig:
     view: ViewConfig = field(default_factory=ViewConfig)
     beam: BeamConfig = field(default_factory=BeamConfig)
     graph: GraphConfig = field(default_factory=GraphConfig)
+    flags: FlagConfig = field(default_factory=FlagConfig)
+    shape: ShapeConfig = field(default_factory=ShapeConfig)
     least_confidence: float = 0.2
     """Frames whose mask is less sure are not looked at."""
-    tracked_cost: float = 0.25
-    """After refinement, a view that fits its neighbours worse on average is lost."""
-    longest_gap_s: float = 0.2
-    """Frames between tracked ones that are at most this far apart get an interpolated pose."""
-    gap_sigma_rad: float = 0.15
-    gap_sigma_m: float = 0.02
-    """Standard deviation of an interpolated pose in the middle of the longest gap."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,6 +66,16 @@ class TossTrack:
     store: ViewStore
 
 
+@dataclass(frozen=True, eq=False)
+class _Known:
+    """What is known before tracking. Poses are camera_from_object (4x4, NaN where unknown)."""
+
+    start: Float[Array, "4 4"] | None
+    start_frame: int | None
+    poses: Float[Array, "n 4 4"] | None
+    model: ShapeViews | None
+
+
 def track_toss(
     frames: Sequence[RgbdFrame],
     masks: Sequence[Bool[Array, "h w"]],
@@ -80,42 +88,90 @@ def track_toss(
     confidence: Float[Array, " n"] | None = None,
     world_from_camera: Transform | None = None,
     start: Transform | None = None,
+    start_frame: int | None = None,
+    poses: Float[Array, "n 4 4"] | None = None,
+    model: ObjectShape | None = None,
+    colorless: Sequence[Bool[Array, "h w"]] | None = None,
     matcher: FeatureMatcher | None = None,
 ) -> TossTrack:
-    """Poses `camera_from_object` of all colour frames of one toss, without a model of the object.
+    """Poses `camera_from_object` of all colour frames of one toss, without a model of the object unless one is given.
 
-    masks: the object's visible pixels in each colour frame; confidence: how sure each is (0..1). world_from_camera
-    tells gravity and the table (z = 0). The object frame is parallel to the camera at the first usable frame, its
-    origin at the middle of the cloud seen there, unless `start` gives that frame's camera_from_object.
-    Raises BadInput where no frame shows enough of the object.
+    masks: the object's visible pixels in each colour frame; confidence: how sure each is (0..1); colorless: pixels of
+    the masks that show something else's colour (an occluder before depth that was drawn). world_from_camera tells
+    gravity and the table (z = 0).
+
+    The object frame is parallel to the camera at the first usable frame, its origin at the middle of the cloud seen
+    there; or `start` gives camera_from_object of frame `start_frame` (None: the first usable one), which is kept.
+    `poses` (NaN where unknown) are refined, only unknown frames are sought. With `model` the object frame is the
+    model's: the object is located anew in the first frame (or starts from `start` or `poses`), then tracked against
+    the model's surface and colours and what the frames themselves show.
+    Raises BadInput where no frame shows enough of the object, or where what is given does not fit together.
     """
     config, progress = config or TrackConfig(), progress or Silent()
     sure = np.ones(len(frames)) if confidence is None else np.asarray(confidence, dtype=np.float64)
-    store, times_s = views_of(frames, masks, camera, sure, config, world_from_camera, progress)
-    first = next((i for i in range(len(frames)) if store.usable(i)), None)
-    if first is None:
+    store, times_s, drawn = views_of(
+        frames, masks, camera, sure, config, world_from_camera, progress, colorless=colorless, model=model
+    )
+    known = _known(start, start_frame, poses, drawn, len(frames))
+    first = _first(store, known, len(frames), toss, config)
+    world = None if world_from_camera is None else world_from_camera.matrix
+    middle = _middle(store, first, known) if model is None else middle_of(model)
+    scene = Scene(store, times_s, gravity_in_camera(world), middle, matcher or Sift())
+    if known.poses is None:
+        best, margin, rejected = _followed(scene, first, known, config, progress)
+    else:
+        best, margin, rejected = _filled_in(scene, known, config, progress)
+    frame = object_frame if model is None else model.object_frame
+    return _refined(scene, best, first, known, margin, rejected, config, toss, camera.frame, frame, frames)
+
+
+def _known(
+    start: Transform | None, start_frame: int | None, poses: Float[Array, "n 4 4"] | None, drawn: ShapeViews | None,
+    count: int,
+) -> _Known:  # fmt: skip
+    """What was given, checked."""
+    if poses is not None and start is not None:
+        raise BadInput("both a start and poses of all frames were given; wanted one of them")
+    if poses is not None and poses.shape != (count, 4, 4):
+        raise BadInput(f"poses of shape {poses.shape} for {count} frames; wanted ({count}, 4, 4), NaN where unknown")
+    if start_frame is not None and (start is None or not 0 <= start_frame < count):
+        raise BadInput(f"start_frame {start_frame} of {count} frames; wanted a frame's position, together with a start")
+    return _Known(None if start is None else start.matrix, start_frame, poses, drawn)
+
+
+def _first(store: ViewStore, known: _Known, count: int, toss: int, config: TrackConfig) -> int:
+    """The frame that tracking starts from."""
+    usable = [i for i in range(count) if store.usable(i)]
+    if not usable:
         raise BadInput(
             f"toss {toss}: no frame shows the object: every mask is empty or has no depth; wanted at least "
             f"{config.view.least_samples} mask pixels with depth: look at the masks with `toss-view`, give a first mask"
         )
-    pose = first_pose(store, first) if start is None else start.matrix
-    world = None if world_from_camera is None else world_from_camera.matrix
-    scene = Scene(store, times_s, gravity_in_camera(world), _middle_guess(store, first), matcher or Sift())
-    best, margin, rejected = _followed(scene, first, pose, config, progress)
-    return _refined(scene, best, first, margin, rejected, config, toss, camera.frame, object_frame, frames)
+    if known.poses is not None:
+        posed = [i for i in usable if np.isfinite(known.poses[i]).all()]
+        if not posed:
+            raise BadInput(f"toss {toss}: none of the {len(usable)} usable frames has one of the given poses")
+        return posed[0]
+    if known.start_frame is not None and known.start_frame not in usable:
+        raise BadInput(f"toss {toss}: frame {known.start_frame}, whose pose is given, does not show the object")
+    return usable[0] if known.start_frame is None else known.start_frame
 
 
 def views_of(
     frames: Sequence[RgbdFrame], masks: Sequence[Bool[Array, "h w"]], camera: CameraModel, sure: Float[Array, " n"],
     config: TrackConfig, world_from_camera: Transform | None, progress: Progress,
-) -> tuple[ViewStore, Float[Array, " n"]]:  # fmt: skip
-    """All frames as views (depth taken as if exposed with colour), and colour times since the first, seconds."""
+    colorless: Sequence[Bool[Array, "h w"]] | None = None, model: ObjectShape | None = None,
+) -> tuple[ViewStore, Float[Array, " n"], ShapeViews | None]:  # fmt: skip
+    """All frames as views (depth taken as if exposed with colour), and colour times since the first, seconds; after
+    them in the store the views of a model, where there is one, and their poses."""
     if len(frames) != len(masks) or len(frames) != len(sure):
         raise BadInput(
             f"{len(frames)} frames, {len(masks)} masks and {len(sure)} confidences; wanted one each per frame"
         )
     if len(frames) == 0:
         raise BadInput("a toss without frames; wanted at least one colour and depth frame")
+    if colorless is not None and len(colorless) != len(frames):
+        raise BadInput(f"{len(frames)} frames and {len(colorless)} masks of colourless pixels; wanted one per frame")
     optics, exposure = Optics.of(camera), Exposure()
     camera_from_world = None if world_from_camera is None else world_from_camera.inverse().matrix
     crops: list[Crop | None] = []
@@ -123,14 +179,16 @@ def views_of(
     for i, frame in enumerate(frames):
         mask = np.asarray(masks[i], dtype=bool)
         gain = exposure.gain(frame.color_rgb, mask)
+        foreign = None if colorless is None or not colorless[i].any() else np.asarray(colorless[i], dtype=bool)
         seen = sure[i] >= config.least_confidence
-        crops.append(cut(frame, mask, i, optics, gain, config.view, camera_from_world) if seen else None)
+        crops.append(cut(frame, mask, i, optics, gain, config.view, camera_from_world, foreign) if seen else None)
         times_ns.append(frame.time_ns)
         progress.step(i + 1, 3 * len(frames), "views")
-    store = ViewStore(optics, crops, config.view)
-    for i in range(len(frames)):
+    drawn = None if model is None else shape_views(model, crops, optics, config.shape)
+    store = ViewStore(optics, [*crops, *(drawn.crops if drawn else ())], config.view)
+    for i in range(len(store)):
         store.fill(i)
-    return store, (np.array(times_ns) - times_ns[0]) * 1e-9
+    return store, (np.array(times_ns) - times_ns[0]) * 1e-9, drawn
 
 
 def first_pose(store: ViewStore, view: int) -> Float[Array, "4 4"]:
@@ -141,17 +199,21 @@ def first_pose(store: ViewStore, view: int) -> Float[Array, "4 4"]:
     return pose
 
 
-def _middle_guess(store: ViewStore, view: int) -> Float[Array, "3"]:
-    """Where the body's middle lies behind the first cloud's middle: a third of its width along the ray."""
+def _middle(store: ViewStore, view: int, known: _Known) -> Float[Array, "3"]:
+    """Where the body's middle lies in the object frame: behind the cloud's middle by a third of its width."""
     first, count = int(store.table[view, k.FIRST]), int(store.table[view, k.COUNT])
     points = store.samples[first : first + count, :3].astype(np.float64)
     middle = points.mean(0)
     width = float(np.ptp(points[:, :2], axis=0).mean())
-    return np.asarray(middle / np.linalg.norm(middle) * width * 0.3)
+    behind = np.asarray(middle / np.linalg.norm(middle) * width * 0.3)
+    pose = known.start if known.poses is None else known.poses[view]
+    if pose is None:
+        return behind
+    return np.asarray(pose[:3, :3].T @ (middle + behind - pose[:3, 3]))
 
 
 def _followed(
-    scene: Scene, first: int, pose: Float[Array, "4 4"], config: TrackConfig, progress: Progress
+    scene: Scene, first: int, known: _Known, config: TrackConfig, progress: Progress
 ) -> tuple[Hypothesis, float, dict[int, list[Candidate]]]:
     """The beam forward, then once more backward with all that forward learned as the model."""
     n = len(scene.times_s)
@@ -159,172 +221,101 @@ def _followed(
     def told(i: int, beam: list[Hypothesis]) -> None:
         progress.step(n + i, 3 * n, "forward")
 
-    ahead = follow(scene, np.arange(first + 1, n), started(scene.store, n, first, pose), config.beam, told)
+    beam, wide = _starts(scene, first, known, config)
+    ahead = follow(scene, np.arange(first + 1, n), beam, wide, told)
     best = ahead.best
     last = best.tracked[-1]
-    known = replace(best, done=(last,), total=0.0)
-    back = follow(scene, np.arange(last - 1, first, -1), known, replace(config.beam, width=2))
-    done = tuple(range(first, n))
-    return replace(back.best, done=done, total=best.total), ahead.margin, ahead.rejected
+    told_all = replace(best, done=(last,), total=0.0)
+    stop = first if known.model is None or known.start is not None else first - 1
+    narrow = replace(config.beam, width=2)
+    back = follow(scene, np.arange(last - 1, stop, -1), [told_all], narrow).best
+    if any(scene.store.usable(i) for i in range(first)):
+        back = follow(scene, np.arange(first - 1, -1, -1), [replace(back, done=(*back.done, first))], narrow).best
+    done = tuple(range(n))
+    return replace(back, done=done, total=best.total), ahead.margin, ahead.rejected
+
+
+def _starts(scene: Scene, first: int, known: _Known, config: TrackConfig) -> tuple[list[Hypothesis], BeamConfig]:
+    """The hypotheses that tracking starts from, and how many are carried."""
+    n = len(scene.times_s)
+    if known.model is None:
+        pose = first_pose(scene.store, first) if known.start is None else known.start
+        return [started(scene.store, n, first, pose)], config.beam
+    if known.start is not None:
+        return [_with_model(started(scene.store, n, first, known.start), known.model)], config.beam
+    wide = replace(config.beam, width=max(config.beam.width, config.shape.starts))
+    beam = []
+    for found in located(scene, first, known.model, config.beam, config.shape):
+        h = _with_model(started(scene.store, n, first, found.pose), known.model)
+        beam.append(replace(h, total=found.fit))
+    if not beam:
+        raise BadInput("the given shape fits nothing that the first frame shows; is it a shape of this object?")
+    return beam, wide
+
+
+def _with_model(h: Hypothesis, model: ShapeViews) -> Hypothesis:
+    """The hypothesis with the model's views (after the frames') among its keyframes."""
+    n, m = len(h.costs), len(model.poses)
+    keys = (*range(n, n + m), *h.keyframes)
+    return replace(h, poses=np.concatenate([h.poses, model.poses]), keyframes=keys)
+
+
+def _filled_in(
+    scene: Scene, known: _Known, config: TrackConfig, progress: Progress
+) -> tuple[Hypothesis, float, dict[int, list[Candidate]]]:
+    """The given poses as one hypothesis; usable frames without one are sought from the known frames around them."""
+    assert known.poses is not None
+    n = len(scene.times_s)
+    given = [i for i in range(n) if scene.store.usable(i) and np.isfinite(known.poses[i]).all()]
+    poses = np.full((n, 4, 4), np.nan)
+    poses[given] = known.poses[given]
+    h = Hypothesis(poses, np.full(n, np.nan), np.full(n, np.nan), tuple(given), (given[0],), 0.0)
+    if known.model is not None:
+        h = _with_model(h, known.model)
+    for i in given[1:]:
+        if is_new(h.poses, i, h.keyframes, scene.center_m, config.beam.keyframes):
+            h = replace(h, keyframes=(*h.keyframes, i))
+    rejected: dict[int, list[Candidate]] = {}
+    for i in range(n):
+        if i in given or not scene.store.usable(i):
+            continue
+        posed = np.flatnonzero(np.isfinite(h.poses[:n, 0, 0]))
+        around = posed[posed < i] if (posed < i).any() else posed[::-1]
+        found = follow(scene, np.array([i]), [replace(h, done=tuple(int(j) for j in around))], config.beam)
+        h, rejected = found.best, {**rejected, **found.rejected}
+        progress.step(n + i, 3 * n, "frames without a pose")
+    return replace(h, done=tuple(range(n))), np.inf, rejected
 
 
 def _refined(
-    scene: Scene, best: Hypothesis, first: int, margin: float, rejected: dict[int, list[Candidate]],
+    scene: Scene, best: Hypothesis, first: int, known: _Known, margin: float, rejected: dict[int, list[Candidate]],
     config: TrackConfig, toss: int, camera: str, object_frame: str, frames: Sequence[RgbdFrame],
 ) -> TossTrack:  # fmt: skip
     """Joint refinement of all tracked views, once more where depth and colour differ in time; then flags."""
-    n = len(scene.times_s)
-    use = np.isfinite(best.poses[:, 0, 0])
-    fixed = np.zeros(n, dtype=bool)
-    fixed[first] = True
+    n, all_views = len(scene.times_s), len(scene.store)
+    use = np.isfinite(best.poses[:n, 0, 0])
+    fixed = np.arange(all_views) >= n
+    fixed[first] = known.model is None or known.start is not None
     poses, center_m = best.poses, scene.center_m
-    still = np.array([i > 0 and use[i] and use[i - 1] and scene.store.stands_still(i - 1, i) for i in range(n)])
+    still = np.array([0 < i < n and use[i] and use[i - 1] and scene.store.stands_still(i - 1, i)
+                      for i in range(all_views)])  # fmt: skip
+    whose = np.maximum(np.arange(all_views) - n + 1, 0)  # a model's views follow each other in no time
+    times_s = np.concatenate([scene.times_s, np.zeros(all_views - n)])
+    drawn = np.array([scene.store.usable(i) for i in range(n, all_views)], dtype=bool)
     delayed = any(c is not None and abs(c.depth_delay_s) > LEAST_DELAY_S for c in scene.store.crops)
     for _ in range(2 if delayed else 1):
         if delayed:
-            use &= put_at_color_times(scene, poses, use)
-        center_m = center_of_mass(poses, use, scene)
-        motion = Motion(scene.times_s, np.zeros(n, dtype=np.int64), scene.gravity_camera_m_s2, center_m, still)
-        joint = refine(scene.store, poses, use, fixed, motion, config.graph)
+            use &= put_at_color_times(scene, poses[:n], use)
+        center_m = center_of_mass(poses[:n], use, scene)
+        motion = Motion(times_s, whose, scene.gravity_camera_m_s2, center_m, still)
+        joint = refine(scene.store, poses, np.concatenate([use, drawn]), fixed, motion, config.graph)
         poses = joint.poses
-    cost, on = _per_view(joint.pairs, joint.figures, n)
-    lost = ~use | (cost > config.tracked_cost)
-    lost[first] = False
-    poses, status, covariance = _flagged(poses, joint.covariance, lost, scene, config)
+    cost, on = (figure[:n] for figure in per_view(joint.pairs, joint.figures, all_views))
+    lost = ~use | (cost > config.flags.tracked_cost)
+    lost[first] &= not fixed[first]
+    poses, status, covariance = flagged(poses[:n], joint.covariance[:n], lost, scene, config.flags)
     times_ns = np.array([f.time_ns for f in frames], dtype=np.int64)
     track = ObjectTrack(toss, camera, object_frame, times_ns, poses, status, covariance)
-    keyframes = tuple(i for i in sorted(best.keyframes) if not lost[i])
-    return TossTrack(track, cost, on, keyframes, joint.pairs, rejected, center_m, margin, scene.store)
-
-
-def put_at_color_times(scene: Scene, poses: Float[Array, "n 4 4"], use: Bool[Array, " n"]) -> Bool[Array, " n"]:
-    """Make every view again with the motion between its two exposures, by neighbouring poses. Which are usable."""
-    index = np.flatnonzero(use)
-    out = use.copy()
-    for a, i in enumerate(index):
-        crop = scene.store.crops[i]
-        if crop is None or abs(crop.depth_delay_s) < LEAST_DELAY_S or len(index) < 2:
-            continue
-        at_depth = _at_depth_time(scene, poses, index, a, crop.depth_delay_s)
-        out[i] = scene.store.fill(int(i), poses[i] @ k.inverse(at_depth))
-    return out
-
-
-def _at_depth_time(
-    scene: Scene, poses: Float[Array, "n 4 4"], index: Int[Array, " m"], a: int, delay_s: float
-) -> Float[Array, "4 4"]:
-    """Pose at depth's exposure of the view index[a]. The motion is that over both neighbours, because errors of single
-    poses would move the depth that they rest on; only an impact's jump is taken from the nearer side."""
-    i, t = index[a], scene.times_s
-    before, after = index[max(a - 1, 0)], index[min(a + 1, len(index) - 1)]
-    side = (i, after) if delay_s > 0 else (before, i)
-    if side[0] == side[1] or scene.store.stands_still(int(side[0]), int(side[1])):
-        return poses[i]
-    speeds = []
-    for x, y in ((before, after), side):
-        centers = [poses[z][:3, :3] @ scene.center_m + poses[z][:3, 3] for z in (x, y)]
-        speeds.append((centers[1] - centers[0]) / (t[y] - t[x]))
-    x, y = side if np.linalg.norm(speeds[0] - speeds[1]) > IMPACT_M_S else (before, after)
-    share = delay_s / (t[y] - t[x])
-    step = between(poses[x], poses[y], abs(float(share)), scene.center_m) @ k.inverse(poses[x])  # camera axes
-    return _carried(poses[i], step if share > 0 else k.inverse(step), poses[x], poses[y], float(share), scene.center_m)
-
-
-def _carried(
-    pose: Float[Array, "4 4"], turn: Float[Array, "4 4"], start: Float[Array, "4 4"], end: Float[Array, "4 4"],
-    share: float, center_m: Float[Array, "3"],
-) -> Float[Array, "4 4"]:  # fmt: skip
-    """`pose` turned as `turn` turns, its middle moved by `share` of the way from `start`'s to `end`'s."""
-    out = np.eye(4)
-    out[:3, :3] = turn[:3, :3] @ pose[:3, :3]
-    way = (end[:3, :3] @ center_m + end[:3, 3]) - (start[:3, :3] @ center_m + start[:3, 3])
-    out[:3, 3] = pose[:3, :3] @ center_m + pose[:3, 3] + share * way - out[:3, :3] @ center_m
-    return out
-
-
-def center_of_mass(poses: Float[Array, "n 4 4"], use: Bool[Array, " n"], scene: Scene) -> Float[Array, "3"]:
-    """From the longest run of views whose motion is that of free flight."""
-    index = np.flatnonzero(use)
-    motion = Motion(
-        scene.times_s, np.zeros(len(poses), dtype=np.int64), scene.gravity_camera_m_s2, scene.center_m, ~use
-    )
-    fly = -scene.gravity_camera_m_s2
-    free = []
-    for a, b, c in zip(index, index[1:], index[2:]):
-        steps = scene.times_s[[a, b, c]]
-        residual, _ = motion_residual((poses[a], poses[b], poses[c]), steps, motion)
-        centers = [poses[x][:3, :3] @ scene.center_m + poses[x][:3, 3] for x in (a, b, c)]
-        change = (centers[2] - centers[1]) / (steps[2] - steps[1]) - (centers[1] - centers[0]) / (steps[1] - steps[0])
-        falls = float(change @ -fly) / (0.5 * (steps[2] - steps[0])) > 0.6 * float(fly @ fly)
-        free.append(bool(falls and np.linalg.norm(residual[:3]) < 3.0))
-    run = _longest_run(free)
-    flying = index[run.start : run.stop + 2] if run.stop > run.start else index[:0]
-    return flight_center(poses, scene.times_s, scene.gravity_camera_m_s2, flying, scene.center_m)
-
-
-def _longest_run(flags: list[bool]) -> range:
-    best, start = range(0), 0
-    for i, flag in enumerate([*flags, False]):
-        if not flag:
-            if i - start > len(best):
-                best = range(start, i)
-            start = i + 1
-    return best
-
-
-def _per_view(pairs: Int[Array, "m 2"], figures: Float[Array, "m 3"], n: int) -> tuple[Array, Array]:
-    """Median cost and share on the surface over the pairs that a view is in; NaN where it is in none."""
-    cost, on = np.full(n, np.nan), np.full(n, np.nan)
-    for i in np.unique(pairs):
-        mine = (pairs == i).any(1)
-        cost[i], on[i] = np.median(figures[mine, 0]), np.median(figures[mine, 1])
-    return cost, on
-
-
-def _flagged(
-    poses: Float[Array, "n 4 4"], covariance: Float[Array, "n 6 6"], lost: Bool[Array, " n"], scene: Scene,
-    config: TrackConfig,
-) -> tuple[Float[Array, "n 4 4"], tuple[Status, ...], Float[Array, "n 6 6"]]:  # fmt: skip
-    """NaN for lost frames, poses from the motion for short gaps between tracked ones, covariance in camera axes."""
-    out, status = poses.copy(), ["tracked"] * len(poses)
-    sigma = np.full((len(poses), 6, 6), np.nan)
-    tracked = np.flatnonzero(~lost)
-    for i in tracked:
-        sigma[i] = camera_covariance(poses[i], covariance[i])
-    for i in np.flatnonzero(lost):
-        out[i], status[i] = np.nan, "lost"
-        before, after = tracked[tracked < i], tracked[tracked > i]
-        if len(before) == 0 or len(after) == 0:
-            continue
-        gap_s = scene.times_s[after[0]] - scene.times_s[before[-1]]
-        if gap_s <= config.longest_gap_s:
-            out[i], status[i] = _in_gap(poses, before, after, int(i), scene), "interpolated"
-            share = gap_s / config.longest_gap_s
-            sigma[i] = np.diag([(config.gap_sigma_rad * share) ** 2] * 3 + [(config.gap_sigma_m * share) ** 2] * 3)
-    return out, tuple(status), sigma  # type: ignore[arg-type]
-
-
-def _in_gap(
-    poses: Float[Array, "n 4 4"], before: Int[Array, " a"], after: Int[Array, " b"], i: int, scene: Scene
-) -> Float[Array, "4 4"]:
-    """Constant spin from the last tracked pose to the next, the centre on a parabola between them."""
-    a, b = int(before[-1]), int(after[0])
-    t = scene.times_s
-    whole = t[b] - t[a]
-    share = float((t[i] - t[a]) / whole)
-    pose = between(poses[a], poses[b], share, scene.center_m)
-    held = np.linalg.norm(poses[b][:3, 3] - poses[a][:3, 3]) < 0.002
-    if not held:
-        pose[:3, 3] -= 0.5 * scene.gravity_camera_m_s2 * whole**2 * share * (1 - share)
-    return pose
-
-
-def camera_covariance(pose: Float[Array, "4 4"], twist_covariance: Float[Array, "6 6"]) -> Float[Array, "6 6"]:
-    """From a twist of the object frame (translation, rotation) to (rotation vector, translation) in camera axes.
-
-    camera_from_object <- camera_from_object exp(-twist): the rotation turns by -R w, the origin moves by -R v.
-    """
-    R = pose[:3, :3]
-    J = np.zeros((6, 6))
-    J[:3, 3:], J[3:, :3] = -R, -R
-    return np.asarray(J @ twist_covariance @ J.T)
+    keyframes = tuple(i for i in sorted(best.keyframes) if i < n and not lost[i])
+    pairs = joint.pairs[(joint.pairs < n).all(1)]
+    return TossTrack(track, cost, on, keyframes, pairs, rejected, center_m, margin, scene.store)

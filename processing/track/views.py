@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int64, UInt8
+from jaxtyping import Bool, Float, Float32, Int64
 from numpy import ndarray as Array
 
 from processing.track import kernels as k
@@ -93,6 +93,8 @@ class Crop:
     height_m: Float32[Array, "h w"] | None
     depth_delay_s: float
     """Depth's exposure time minus colour's."""
+    colorless: Bool[Array, "h w"] | None = None
+    """Pixels of the mask whose colour is not the object's; None: there are none."""
 
 
 def cut(
@@ -103,8 +105,10 @@ def cut(
     gain: float,
     config: ViewConfig,
     camera_from_world: Float[Array, "4 4"] | None = None,
+    colorless: Bool[Array, "h w"] | None = None,
 ) -> Crop | None:
-    """The crop around the mask, or None where the mask holds too little. `camera_from_world` has the table at z = 0."""
+    """The crop around the mask, or None where the mask holds too little. `camera_from_world` has the table at z = 0;
+    `colorless` marks pixels of the mask that show something else's colour."""
     straight_mask = optics.straight(mask.astype(np.uint8), smooth=False) > 0
     rows, columns = np.flatnonzero(straight_mask.any(1)), np.flatnonzero(straight_mask.any(0))
     if len(rows) == 0 or int(straight_mask.sum()) < config.least_samples:
@@ -120,7 +124,8 @@ def cut(
     height_m = _heights(depth_m, (left, top), optics, camera_from_world)
     covered = _covered(depth_m, inside, height_m, config)
     delay_s = (frame.depth_time_ns - frame.time_ns) * 1e-9
-    return Crop(position, (int(left), int(top)), inside, depth_m, color, covered, height_m, delay_s)
+    foreign = None if colorless is None else optics.straight(colorless.astype(np.uint8), smooth=False)[area] > 0
+    return Crop(position, (int(left), int(top)), inside, depth_m, color, covered, height_m, delay_s, foreign)
 
 
 def _heights(
@@ -190,7 +195,7 @@ def make_view(crop: Crop, optics: Optics, config: ViewConfig, motion: Float[Arra
     pixels[..., k.Z], pixels[..., k.NX : k.NZ + 1] = smooth_m, normals
     outside = cv2.distanceTransform((~crop.mask).astype(np.uint8), cv2.DIST_L2, 5)
     pixels[..., k.OUTSIDE] = np.where(crop.covered, k.HIDDEN, outside)
-    pixels[..., k.SHARP :] = _looks(crop.color, crop.mask, config)
+    pixels[..., k.SHARP :] = _looks(crop, config)
     samples = _samples(pixels, rays, config, crop.position)
     return View(crop.position, crop.corner, pixels, samples) if len(samples) >= config.least_samples else None
 
@@ -241,10 +246,12 @@ def _moved_depth(crop: Crop, optics: Optics, motion: Float[Array, "4 4"], config
     return np.where(np.isfinite(out) & crop.mask, out, np.float32(0))
 
 
-def _looks(color: Float32[Array, "h w 3"], mask: Bool[Array, "h w"], config: ViewConfig) -> Float32[Array, "h w 6"]:
+def _looks(crop: Crop, config: ViewConfig) -> Float32[Array, "h w 6"]:
     """Brightness divided by that around it (shading and shadows stay with the room, not with the object), and two
     differences of colour, each sharp and smooth."""
-    weight = mask.astype(np.float32)
+    color, mask = crop.color, crop.mask
+    foreign = None if crop.colorless is None else cv2.dilate(crop.colorless.astype(np.uint8), np.ones((3, 3))) > 0
+    weight = (mask if foreign is None else mask & ~foreign).astype(np.float32)
     red, green, blue = color[..., 0], color[..., 1], color[..., 2]
     gray = 0.299 * red + 0.587 * green + 0.114 * blue
     total = red + green + blue + 0.1
@@ -255,7 +262,10 @@ def _looks(color: Float32[Array, "h w 3"], mask: Bool[Array, "h w"], config: Vie
     )
     smooth = [_masked_blur(look, weight, config.smooth_px) for look in looks]
     sharp = [np.where(mask, look, blurred) for look, blurred in zip(looks, smooth)]
-    return np.stack([*sharp, *smooth], -1).astype(np.float32)
+    out = np.stack([*sharp, *smooth], -1).astype(np.float32)
+    if foreign is not None:
+        out[foreign & mask] = k.NO_LOOK
+    return out
 
 
 def _masked_blur(image: Float32[Array, "h w"], weight: Float32[Array, "h w"], sigma_px: float) -> Float32[Array, "h w"]:
@@ -372,29 +382,3 @@ class ViewStore:
             tables.append(table)
         out.table = np.concatenate(tables)
         return out
-
-
-class Exposure:
-    """Brightness of each frame against the first, from pixels that belong to the object in neither (median of ratios).
-
-    1 where the background tells nothing. The response is not linear: a ratio of stored values serves small gains well.
-    """
-
-    def __init__(self, step: int = 8) -> None:
-        self._step = step
-        self._first: tuple[Float32[Array, "a b"], Bool[Array, "a b"]] | None = None
-
-    def gain(self, color_rgb: UInt8[Array, "h w 3"], mask: Bool[Array, "h w"]) -> float:
-        share = 1 / self._step
-        small = (
-            cv2.resize(color_rgb, None, fx=share, fy=share, interpolation=cv2.INTER_AREA).mean(-1).astype(np.float32)
-        )
-        size = (small.shape[1], small.shape[0])
-        taken = cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0
-        free = cv2.dilate(taken.astype(np.uint8), np.ones((3, 3), np.uint8), iterations=2) == 0
-        if self._first is None:
-            self._first = (small, free)
-            return 1.0
-        first, first_free = self._first
-        use = first_free & free & (first > 15) & (first < 235) & (small > 10) & (small < 240)
-        return float(np.median(small[use] / first[use])) if int(use.sum()) > 50 else 1.0

@@ -13,11 +13,12 @@ from hypothesis import strategies as st
 from processing.metrics import align_first, frame_errors
 from processing.track import kernels as k
 from processing.track.features import rigid_fit
+from processing.track.flags import camera_covariance
 from processing.track.graph import flight_center
 from processing.track.keyframes import KeyframeConfig, references
-from processing.track.motion import MotionConfig, change_cost, moved, steady_spin, turn_between
-from processing.track.register import all_turns, register_tosses
-from processing.track.sequence import TossTrack, camera_covariance, track_toss
+from processing.track.motion import MotionConfig, all_turns, change_cost, moved, steady_spin, turn_between
+from processing.track.register import register_tosses
+from processing.track.sequence import TossTrack, track_toss
 from processing.track.views import Optics, ViewConfig, cut, make_view
 from recordings.errors import BadInput
 from recordings.geometry import CameraModel, Transform, rotation_exp

@@ -1,0 +1,59 @@
+"""Depth that is exposed at another time than colour: every view made again with the motion between the two."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from numpy import ndarray as Array
+
+from processing.track import kernels as k
+from processing.track.beam import LEAST_DELAY_S, Scene
+from processing.track.motion import between
+
+IMPACT_M_S = 0.35
+"""A change of velocity around a frame beyond this is an impact."""
+
+
+def put_at_color_times(scene: Scene, poses: Float[Array, "n 4 4"], use: Bool[Array, " n"]) -> Bool[Array, " n"]:
+    """Make every view again with the motion between its two exposures, by neighbouring poses. Which are usable."""
+    index = np.flatnonzero(use)
+    out = use.copy()
+    for a, i in enumerate(index):
+        crop = scene.store.crops[i]
+        if crop is None or abs(crop.depth_delay_s) < LEAST_DELAY_S or len(index) < 2:
+            continue
+        at_depth = _at_depth_time(scene, poses, index, a, crop.depth_delay_s)
+        out[i] = scene.store.fill(int(i), poses[i] @ k.inverse(at_depth))
+    return out
+
+
+def _at_depth_time(
+    scene: Scene, poses: Float[Array, "n 4 4"], index: Int[Array, " m"], a: int, delay_s: float
+) -> Float[Array, "4 4"]:
+    """Pose at depth's exposure of the view index[a]. The motion is that over both neighbours, because errors of single
+    poses would move the depth that they rest on; only an impact's jump is taken from the nearer side."""
+    i, t = index[a], scene.times_s
+    before, after = index[max(a - 1, 0)], index[min(a + 1, len(index) - 1)]
+    side = (i, after) if delay_s > 0 else (before, i)
+    if side[0] == side[1] or scene.store.stands_still(int(side[0]), int(side[1])):
+        return poses[i]
+    speeds = []
+    for x, y in ((before, after), side):
+        centers = [poses[z][:3, :3] @ scene.center_m + poses[z][:3, 3] for z in (x, y)]
+        speeds.append((centers[1] - centers[0]) / (t[y] - t[x]))
+    x, y = side if np.linalg.norm(speeds[0] - speeds[1]) > IMPACT_M_S else (before, after)
+    share = delay_s / (t[y] - t[x])
+    step = between(poses[x], poses[y], abs(float(share)), scene.center_m) @ k.inverse(poses[x])  # camera axes
+    return _carried(poses[i], step if share > 0 else k.inverse(step), poses[x], poses[y], float(share), scene.center_m)
+
+
+def _carried(
+    pose: Float[Array, "4 4"], turn: Float[Array, "4 4"], start: Float[Array, "4 4"], end: Float[Array, "4 4"],
+    share: float, center_m: Float[Array, "3"],
+) -> Float[Array, "4 4"]:  # fmt: skip
+    """`pose` turned as `turn` turns, its middle moved by `share` of the way from `start`'s to `end`'s."""
+    out = np.eye(4)
+    out[:3, :3] = turn[:3, :3] @ pose[:3, :3]
+    way = (end[:3, :3] @ center_m + end[:3, 3]) - (start[:3, :3] @ center_m + start[:3, 3])
+    out[:3, 3] = pose[:3, :3] @ center_m + pose[:3, 3] + share * way - out[:3, :3] @ center_m
+    return out

@@ -1,0 +1,84 @@
+"""What is said of each frame: how well it fits, whether its pose may be trusted, how far it may be off."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from numpy import ndarray as Array
+
+from processing.track.beam import Scene
+from processing.track.motion import between
+from recordings.tracks import Status
+
+
+@dataclass(frozen=True)
+class FlagConfig:
+    """When a frame is lost, and how far an interpolated pose may be off."""
+
+    tracked_cost: float = 0.25
+    """After refinement, a view that fits its neighbours worse on average is lost."""
+    longest_gap_s: float = 0.2
+    """Frames between tracked ones that are at most this far apart get an interpolated pose."""
+    gap_sigma_rad: float = 0.15
+    gap_sigma_m: float = 0.02
+    """Standard deviation of an interpolated pose in the middle of the longest gap."""
+
+
+def per_view(pairs: Int[Array, "m 2"], figures: Float[Array, "m 3"], n: int) -> tuple[Array, Array]:
+    """Median cost and share on the surface over the pairs that a view is in; NaN where it is in none."""
+    cost, on = np.full(n, np.nan), np.full(n, np.nan)
+    for i in np.unique(pairs):
+        mine = (pairs == i).any(1)
+        cost[i], on[i] = np.median(figures[mine, 0]), np.median(figures[mine, 1])
+    return cost, on
+
+
+def flagged(
+    poses: Float[Array, "n 4 4"], covariance: Float[Array, "n 6 6"], lost: Bool[Array, " n"], scene: Scene,
+    config: FlagConfig,
+) -> tuple[Float[Array, "n 4 4"], tuple[Status, ...], Float[Array, "n 6 6"]]:  # fmt: skip
+    """NaN for lost frames, poses from the motion for short gaps between tracked ones, covariance in camera axes."""
+    out, status = poses.copy(), ["tracked"] * len(poses)
+    sigma = np.full((len(poses), 6, 6), np.nan)
+    tracked = np.flatnonzero(~lost)
+    for i in tracked:
+        sigma[i] = camera_covariance(poses[i], covariance[i])
+    for i in np.flatnonzero(lost):
+        out[i], status[i] = np.nan, "lost"
+        before, after = tracked[tracked < i], tracked[tracked > i]
+        if len(before) == 0 or len(after) == 0:
+            continue
+        gap_s = scene.times_s[after[0]] - scene.times_s[before[-1]]
+        if gap_s <= config.longest_gap_s:
+            out[i], status[i] = _in_gap(poses, before, after, int(i), scene), "interpolated"
+            share = gap_s / config.longest_gap_s
+            sigma[i] = np.diag([(config.gap_sigma_rad * share) ** 2] * 3 + [(config.gap_sigma_m * share) ** 2] * 3)
+    return out, tuple(status), sigma  # type: ignore[arg-type]
+
+
+def _in_gap(
+    poses: Float[Array, "n 4 4"], before: Int[Array, " a"], after: Int[Array, " b"], i: int, scene: Scene
+) -> Float[Array, "4 4"]:
+    """Constant spin from the last tracked pose to the next, the centre on a parabola between them."""
+    a, b = int(before[-1]), int(after[0])
+    t = scene.times_s
+    whole = t[b] - t[a]
+    share = float((t[i] - t[a]) / whole)
+    pose = between(poses[a], poses[b], share, scene.center_m)
+    held = np.linalg.norm(poses[b][:3, 3] - poses[a][:3, 3]) < 0.002
+    if not held:
+        pose[:3, 3] -= 0.5 * scene.gravity_camera_m_s2 * whole**2 * share * (1 - share)
+    return pose
+
+
+def camera_covariance(pose: Float[Array, "4 4"], twist_covariance: Float[Array, "6 6"]) -> Float[Array, "6 6"]:
+    """From a twist of the object frame (translation, rotation) to (rotation vector, translation) in camera axes.
+
+    camera_from_object <- camera_from_object exp(-twist): the rotation turns by -R w, the origin moves by -R v.
+    """
+    R = pose[:3, :3]
+    J = np.zeros((6, 6))
+    J[:3, 3:], J[3:, :3] = -R, -R
+    return np.asarray(J @ twist_covariance @ J.T)

@@ -1,0 +1,185 @@
+"""A learned shape as the tracker's model: the shape drawn from all sides, and the object located in it anew.
+
+The tracker's model is a set of views at their poses; a shape becomes such views by ray casting, so that everything that
+aligns a frame to other frames aligns it to the shape as well. What no camera saw of the shape has neither depth nor
+colour in them, and a shape without colours has none anywhere.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+from numpy import ndarray as Array
+
+from processing.track import kernels as k
+from processing.track.beam import BeamConfig, Candidate, Scene, Schedule, merged, rows
+from processing.track.features import relative_motions
+from processing.track.keyframes import references
+from processing.track.motion import all_turns
+from processing.track.views import Crop, Optics
+from recordings.errors import BadInput
+from recordings.tracks import ObjectShape
+
+
+@dataclass(frozen=True)
+class ShapeConfig:
+    """How a shape is drawn and sought."""
+
+    directions: int = 42
+    """Views of the shape, spread evenly over all directions."""
+    turns: int = 480
+    """Orientations tried in the first frame."""
+    tried: int = 32
+    """The best of them that are aligned coarsely ..."""
+    starts: int = 8
+    """... and of those, the ones that tracking starts from."""
+    spread: float = 0.12
+    """A start that fits worse than the best by more than this is none."""
+    seek: Schedule = ((1, 6, 0.015, 0.6, 0.012, 0.12),)
+
+
+@dataclass(frozen=True, eq=False)
+class ShapeViews:
+    """Drawn views of a shape and their poses, camera_from_object (m, 4, 4)."""
+
+    crops: tuple[Crop, ...]
+    poses: Float[Array, "m 4 4"]
+
+
+def middle_of(shape: ObjectShape) -> Float[Array, "3"]:
+    """Middle of the shape's box, object frame."""
+    return np.asarray(0.5 * (shape.vertices_m.min(0) + shape.vertices_m.max(0)))
+
+
+def shape_views(shape: ObjectShape, crops: list[Crop | None], optics: Optics, config: ShapeConfig) -> ShapeViews:
+    """The shape drawn from all sides at the distance that the frames' crops show the object at."""
+    if len(shape.faces) == 0:
+        raise BadInput("the given shape has no faces; wanted a triangle mesh")
+    seen = [
+        float(np.median(c.depth_m[c.mask & (c.depth_m > 0)])) for c in crops if c and (c.mask & (c.depth_m > 0)).any()
+    ]
+    size_m = float(np.linalg.norm(np.ptp(shape.vertices_m, axis=0)))
+    distance_m = max(float(np.median(seen)) if seen else 0.8, 1.2 * size_m)
+    poses = _around(middle_of(shape), distance_m, config.directions)
+    draw = _Painter(shape, optics)
+    return ShapeViews(tuple(draw.crop(pose, len(crops) + i) for i, pose in enumerate(poses)), poses)
+
+
+def _around(middle_m: Float[Array, "3"], distance_m: float, count: int) -> Float[Array, "m 4 4"]:
+    """Poses that show the object from `count` directions, its middle on the optical axis."""
+    n = np.arange(count) + 0.5
+    z, phi = 1 - 2 * n / count, np.pi * (1 + 5**0.5) * n
+    r = np.sqrt(1 - z * z)
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    for pose, direction in zip(poses, np.stack([r * np.cos(phi), r * np.sin(phi), z], -1)):
+        right = np.cross(direction, [0.0, 0.0, 1.0] if abs(direction[2]) < 0.9 else [1.0, 0.0, 0.0])
+        right /= np.linalg.norm(right)
+        pose[:3, :3] = np.stack([right, np.cross(-direction, right), -direction])
+        pose[:3, 3] = np.array([0.0, 0.0, distance_m]) - pose[:3, :3] @ middle_m
+    return poses
+
+
+class _Painter:
+    """Draws a shape's depth and colours as the ideal pinhole sees them, by one ray a pixel."""
+
+    def __init__(self, shape: ObjectShape, optics: Optics) -> None:
+        import open3d as o3d
+
+        self._shape, self._optics, self._core = shape, optics, o3d.core
+        self._scene = o3d.t.geometry.RaycastingScene()
+        vertices, faces = shape.vertices_m.astype(np.float32), shape.faces.astype(np.uint32)
+        self._scene.add_triangles(o3d.core.Tensor(vertices), o3d.core.Tensor(faces))
+
+    def crop(self, pose: Float[Array, "4 4"], position: int, margin_px: int = 14) -> Crop:
+        c = self._optics.camera
+        points = self._shape.vertices_m @ pose[:3, :3].T + pose[:3, 3]
+        pixels = points[:, :2] / points[:, 2:] * self._optics.focal + self._optics.center
+        low = np.floor(pixels.min(0)).astype(int) - margin_px
+        high = np.ceil(pixels.max(0)).astype(int) + margin_px + 1
+        u, v = np.meshgrid(np.arange(low[0], high[0]), np.arange(low[1], high[1]))
+        rays = np.stack([(u - c.cx) / c.fx, (v - c.cy) / c.fy, np.ones(u.shape)], -1) @ pose[:3, :3]
+        origin = np.broadcast_to(-pose[:3, :3].T @ pose[:3, 3], rays.shape)
+        hit = self._scene.cast_rays(self._core.Tensor(np.concatenate([origin, rays], -1).astype(np.float32)))
+        depth = hit["t_hit"].numpy()
+        mask = np.isfinite(depth)
+        color, known = self._painted(hit["primitive_ids"].numpy(), hit["primitive_uvs"].numpy(), mask)
+        depth = np.where(mask & known, depth, 0).astype(np.float32)
+        foreign = mask & (np.ones_like(mask) if self._shape.vertex_rgb is None else ~known)
+        corner = (int(low[0]), int(low[1]))
+        hidden = np.zeros_like(mask)
+        return Crop(position, corner, mask, depth, color, hidden, None, 0.0, foreign if foreign.any() else None)
+
+    def _painted(self, triangle: Array, uv: Array, mask: Array) -> tuple[Array, Array]:
+        """Colour 0..1 of each pixel, and whether a camera saw the surface there."""
+        corners = self._shape.faces[np.where(mask, triangle, 0)]
+        share = np.stack([1 - uv.sum(-1), uv[..., 0], uv[..., 1]], -1)[..., None]
+        rgb = (
+            np.full((len(self._shape.vertices_m), 3), 128, np.uint8)
+            if self._shape.vertex_rgb is None
+            else self._shape.vertex_rgb
+        )
+        color = np.where(mask[..., None], (rgb[corners] / 255.0 * share).sum(-2), 0).astype(np.float32)
+        seen = self._shape.observed
+        known = np.ones_like(mask) if seen is None else seen[corners].all(-1)
+        return color, known & mask
+
+
+def located(scene: Scene, view: int, model: ShapeViews, beam: BeamConfig, config: ShapeConfig) -> list[Candidate]:
+    """Poses at which the shape fits what one frame shows, best first: from feature matches with the drawn views, and
+    from a grid over all orientations. Several, where the shape looks alike from several sides."""
+    n = len(scene.times_s)
+    drawn = np.arange(n, n + len(model.poses))
+    poses = np.concatenate([np.full((n, 4, 4), np.nan), model.poses])
+    tries = [(config.seek, pose) for pose in _grid(scene, view, config)]
+    tries += [(beam.coarse, pose) for pose in _by_features(scene, view, drawn, poses, beam)]
+    tried = sorted((_fitted(scene, view, p, poses, drawn, s, beam) for s, p in tries), key=lambda c: c.cost)
+    rough = merged(tried[: 4 * config.tried], beam)[: config.tried]
+    coarse = merged([_fitted(scene, view, c.pose, poses, drawn, beam.coarse, beam) for c in rough], beam)
+    fine = merged(
+        [_fitted(scene, view, c.pose, poses, drawn, beam.fine, beam) for c in coarse[: 2 * config.starts]], beam
+    )
+    good = [c for c in fine if c.fit < beam.lost and c.fit < fine[0].fit + config.spread]
+    return good[: config.starts]
+
+
+def _grid(scene: Scene, view: int, config: ShapeConfig) -> list[Float[Array, "4 4"]]:
+    """All orientations, the shape's middle somewhat behind what is seen."""
+    row = scene.store.table[view]
+    points = scene.store.samples[row[k.FIRST] : row[k.FIRST] + row[k.COUNT], :3].astype(np.float64)
+    seen = points.mean(0)
+    behind = seen * (1 + 0.3 * float(np.ptp(points[:, :2], axis=0).mean()) / float(np.linalg.norm(seen)))
+    out = []
+    for turn in all_turns(config.turns):
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = turn, behind - turn @ scene.center_m
+        out.append(pose)
+    return out
+
+
+def _by_features(
+    scene: Scene, view: int, drawn: Int[Array, " m"], poses: Float[Array, "n 4 4"], beam: BeamConfig
+) -> list[Float[Array, "4 4"]]:
+    here = scene.described(view)
+    out = []
+    for j in drawn:
+        for motion in relative_motions(scene.matcher, scene.described(int(j)), here, beam.ransac, seed=int(j), most=1):
+            out.append(motion.other_from_one @ poses[j])
+    return out
+
+
+def _fitted(
+    scene: Scene, view: int, pose: Float[Array, "4 4"], poses: Float[Array, "n 4 4"], drawn: Int[Array, " m"],
+    schedule: Schedule, beam: BeamConfig,
+) -> Candidate:  # fmt: skip
+    """One pose aligned to the drawn views that look from its side."""
+    refs = references(poses, tuple(int(i) for i in drawn), int(drawn[0]), pose, scene.center_m, beam.keyframes)
+    store = scene.store
+    distance = float(np.linalg.norm(store.center_m[view]))
+    aligned, _, fit, on, _ = k.align_view(
+        np.ascontiguousarray(pose), view, refs, np.ascontiguousarray(poses[refs]), store.maps, store.samples,
+        store.table, store.optics.focal, store.optics.center, rows(schedule, distance), np.zeros(6), np.eye(4),
+    )  # fmt: skip
+    good = bool(np.isfinite(aligned).all())
+    return Candidate(aligned if good else pose, float(fit) if good else 1.0, 0.0, float(on), "located")
