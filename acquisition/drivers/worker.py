@@ -19,7 +19,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from acquisition.devices import DeviceLost
 
@@ -114,15 +114,21 @@ class WorkerEnd:
         self._out = os.dup(1)
         os.dup2(2, 1)  # whatever the vendor's library prints must not meet the frames
         self._in = 0
+        self._writing = threading.Lock()
         gc.disable()  # no pauses in a 1 kHz loop; nothing here makes cycles
 
     def emit(self, kind: bytes, payload: bytes) -> None:
         data = _frame(kind, payload)
-        while data:
-            data = data[os.write(self._out, data) :]
+        with self._writing:
+            while data:
+                data = data[os.write(self._out, data) :]
 
     def event(self, event: str, **detail: Any) -> None:
         self.emit(b"J", json.dumps({"event": event, **detail}).encode())
+
+    def leave(self) -> NoReturn:
+        """End the process now: threads inside the vendor's library may still be waiting for an answer."""
+        os._exit(0)
 
     def waiting(self) -> bool:
         """Whether a command (or the end of the driver) is there."""
