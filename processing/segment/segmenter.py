@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from jaxtyping import Bool
 from numpy import ndarray as Array
@@ -30,6 +30,7 @@ class Example:
     mask: Bool[Array, "h w"]
 
 
+@runtime_checkable
 class Segmenter(Protocol):
     """Finds the object in every frame of one toss, from given masks or from nothing. One class per backend."""
 
