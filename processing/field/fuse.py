@@ -86,6 +86,7 @@ def fuse(views: Sequence[FieldView], config: FuseConfig) -> Grid:
             view.plane,
             view.outside,
             view.color_rgb,
+            view.inside if view.colorless is None else view.inside & ~view.colorless,
         )
     free = passed > np.maximum(2.0, 0.2 * blocked)
     sdf_m = np.where(weight > 0, total / np.maximum(weight, 1e-9), 0).astype(np.float32)
@@ -103,7 +104,9 @@ def _spread(rgb: Float32[Array, "a b c 3"], known: Bool[Array, "a b c"]) -> Floa
 
 @numba.njit(cache=True, nogil=True, fastmath=True)
 @no_type_check  # numba cannot cache what the tests' type checker wraps
-def _integrate(total, weight, passed, blocked, paint, low, voxel, truncation, pose, K, depth, plane, outside, rgb):
+def _integrate(
+    total, weight, passed, blocked, paint, low, voxel, truncation, pose, K, depth, plane, outside, rgb, colored
+):
     """One view into the sums. Cells are walked along the last axis; all lengths in metres."""
     height, width = depth.shape
     n0, n1, n2 = total.shape
@@ -138,7 +141,7 @@ def _integrate(total, weight, passed, blocked, paint, low, voxel, truncation, po
                                     blocked[i, j, k] += 1
                                     if distance < -BEHIND_FULL * truncation:
                                         w *= (np.float32(1.0) + distance / truncation) / (np.float32(1.0) - BEHIND_FULL)
-                                if abs(distance) < np.float32(0.6) * truncation:
+                                if colored[v, u] and abs(distance) < np.float32(0.6) * truncation:
                                     for c in range(3):
                                         paint[i, j, k, c] += w * facing * rgb[v, u, c] / np.float32(255)
                                     paint[i, j, k, 3] += w * facing

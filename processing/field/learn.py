@@ -29,12 +29,14 @@ class LearnConfig:
 
 @dataclass(frozen=True, eq=False)
 class TossViews:
-    """One toss as the field sees it: frames are read when they are chosen."""
+    """One toss as the field sees it: frames are read when they are chosen. `colorless`: pixels of each mask whose
+    colour is not the object's."""
 
     frames: Sequence[RgbdFrame]
     depth_times_ns: Int64[Array, " n"]
     masks: Sequence[Bool[Array, "h w"]]
     track: ObjectTrack
+    colorless: Sequence[Bool[Array, "h w"]] | None = None
 
 
 def learn_shape(
@@ -59,7 +61,8 @@ def learn_shape(
 def _view(toss: TossViews, position: int, camera: CameraModel) -> FieldView | None:
     pose = toss.track.camera_from_object[position]
     at_depth = pose_at(toss.track, position, int(toss.depth_times_ns[position]))
-    return make_view(toss.frames[position], toss.masks[position], camera, pose, at_depth)
+    foreign = None if toss.colorless is None else toss.colorless[position]
+    return make_view(toss.frames[position], toss.masks[position], camera, pose, at_depth, colorless=foreign)
 
 
 def pose_at(track: ObjectTrack, position: int, time_ns: int) -> Float[Array, "4 4"]:

@@ -90,7 +90,8 @@ def _normal_equations(
     luma_gradient = luma_gradient - sdf_gradient * ((luma_gradient * along).sum(-1) / facing)[:, None]
     seen = pool.rgb[rays] @ torch.tensor(LUMA, device=points.device)
     depth_sigma = config.depth_sigma_m * (pool.depth[rays] / 0.8) ** 2
-    difference = _less_exposure(luma - seen, view, len(rotation))
+    colored = pool.colored[rays]
+    difference = _less_exposure(luma - seen, view, len(rotation), colored)
     information = torch.zeros(len(rotation), 6, 6, device=points.device)
     right = torch.zeros(len(rotation), 6, device=points.device)
     for residual, gradient, sigma, outlier in (
@@ -101,6 +102,8 @@ def _normal_equations(
         scaled = (residual / sigma).abs()
         weight = torch.where(scaled < 1.5, torch.ones_like(scaled), 1.5 / scaled) / sigma**2
         weight = torch.where(scaled < outlier, weight, torch.zeros_like(weight)) * CORRELATED
+        if residual is difference:
+            weight = weight * colored
         information.index_add_(0, view, weight[:, None, None] * jacobian[:, :, None] * jacobian[:, None, :])
         right.index_add_(0, view, -(weight * residual)[:, None] * jacobian)
     return information, right
@@ -110,10 +113,10 @@ CORRELATED = 0.1
 """Neighbouring pixels share their noise: this share of them counts as independent."""
 
 
-def _less_exposure(difference: Tensor, view: Tensor, views: int) -> Tensor:
-    """Luminance differences less their mean in each view: auto exposure drifts."""
-    total = torch.zeros(views, device=difference.device).index_add_(0, view, difference)
-    count = torch.zeros(views, device=difference.device).index_add_(0, view, torch.ones_like(difference))
+def _less_exposure(difference: Tensor, view: Tensor, views: int, colored: Tensor) -> Tensor:
+    """Luminance differences less their mean in each view over coloured pixels: auto exposure drifts."""
+    total = torch.zeros(views, device=difference.device).index_add_(0, view, difference * colored)
+    count = torch.zeros(views, device=difference.device).index_add_(0, view, colored)
     return difference - (total / count.clamp(min=1))[view]
 
 

@@ -15,6 +15,7 @@ from processing.field.views import FieldView
 @dataclass(frozen=True, eq=False)
 class RayPool:
     """`direction` (n, 3) with z = 1, `depth` (n,) metres along z, `plane` (n, 3), `rgb` (n, 3) in 0..1, `view` (n,).
+    `colored` (n,) is 1, or 0 where the pixel's colour is not the object's.
 
     `passing_*`: rays that pass the object (same meaning).
     """
@@ -24,6 +25,7 @@ class RayPool:
     plane: Tensor
     rgb: Tensor
     view: Tensor
+    colored: Tensor
     passing_direction: Tensor
     passing_view: Tensor
 
@@ -41,6 +43,7 @@ def make_pool(views: Sequence[FieldView]) -> RayPool:
         parts["plane"].append(view.plane[v, u])
         parts["rgb"].append(view.color_rgb[v, u].astype(np.float32) / 255)
         parts["view"].append(np.full(len(u), number))
+        parts["colored"].append(np.ones(len(u)) if view.colorless is None else ~view.colorless[v, u])
         v, u = np.nonzero(view.outside)
         parts["passing_direction"].append(_directions(view, u, v))
         parts["passing_view"].append(np.full(len(u), number))

@@ -201,7 +201,7 @@ def color_loss(model: ObjectField, poses: Poses, pool: RayPool, chosen: Tensor) 
     """Mean absolute difference of the colour at the measured surface point."""
     in_camera = pool.direction[chosen] * pool.depth[chosen][:, None]
     _, rgb = model(to_object(poses, in_camera, pool.view[chosen]))
-    return (rgb - pool.rgb[chosen]).abs().mean()
+    return ((rgb - pool.rgb[chosen]).abs() * pool.colored[chosen, None]).mean()
 
 
 def eikonal_loss(model: ObjectField, points: Tensor) -> Tensor:

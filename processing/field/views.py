@@ -27,6 +27,7 @@ class FieldView:
     `depth_m` is 0 where there is no trustworthy return on the object. `plane` is the local surface in camera
     coordinates as n with n . X = 1 (fitted to inverse depth). `outside` marks rays that surely pass the object.
     `camera_from_object` is the pose at the colour exposure, `camera_from_object_at_depth` at the depth exposure.
+    `colorless` marks pixels whose colour is not the object's (None: there are none).
     """
 
     K: Float[Array, "3 3"]
@@ -37,6 +38,7 @@ class FieldView:
     outside: Bool[Array, "h w"]
     camera_from_object: Float[Array, "4 4"]
     camera_from_object_at_depth: Float[Array, "4 4"]
+    colorless: Bool[Array, "h w"] | None = None
 
     def posed(self, at_color: Float[Array, "4 4"], at_depth: Float[Array, "4 4"]) -> FieldView:
         return replace(self, camera_from_object=at_color, camera_from_object_at_depth=at_depth)
@@ -49,9 +51,11 @@ def make_view(
     camera_from_object: Float[Array, "4 4"],
     camera_from_object_at_depth: Float[Array, "4 4"],
     hidden: Bool[Array, "h w"] | None = None,
+    colorless: Bool[Array, "h w"] | None = None,
 ) -> FieldView | None:
     """Cut a view out of a frame; None when the mask is empty. `hidden`: pixels of something that may stand in front
-    of the object (the robot): their rays tell nothing. Raises BadInput for a mask of another size."""
+    of the object (the robot): their rays tell nothing. `colorless`: pixels of the mask that show its colour instead of
+    the object's. Raises BadInput for a mask of another size."""
     if mask.shape != frame.depth_m.shape:
         raise BadInput(f"frame {frame.index}: a mask of {mask.shape}, the image has {frame.depth_m.shape}")
     pinhole = replace(camera, distortion_model="none", distortion=())
@@ -74,7 +78,12 @@ def make_view(
         outside &= ~_dilate(_remap(hidden.astype(np.uint8), maps, cv2.INTER_NEAREST)[box] > 0, EDGE_PX)
     depth_m, plane = _trusted(np.where(inside, depth_m, 0).astype(np.float32), K)
     color_rgb = _remap(frame.color_rgb, maps, cv2.INTER_LINEAR)[box]
-    return FieldView(K, color_rgb, depth_m, plane, inside, outside, camera_from_object, camera_from_object_at_depth)
+    foreign = None
+    if colorless is not None and colorless.any():
+        foreign = _dilate(_remap(colorless.astype(np.uint8), maps, cv2.INTER_NEAREST)[box] > 0, 1)
+    return FieldView(
+        K, color_rgb, depth_m, plane, inside, outside, camera_from_object, camera_from_object_at_depth, foreign
+    )
 
 
 def object_box(views: Sequence[FieldView], trim: float = 0.002) -> tuple[Float[Array, "3"], Float[Array, "3"]]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -133,6 +135,22 @@ def test_vertex_colours_are_the_cubes(views):
     for axis, red in enumerate(RED_OF_FACE):
         inner = (size.argmax(1) == axis) & (np.sort(size, axis=1)[:, 1] < HALF_M - 0.006)
         assert np.median(shape.vertex_rgb[inner, 0]) == pytest.approx(red, abs=12)
+
+
+def test_foreign_colour_does_not_reach_the_shape(views):
+    painted = []
+    for number, view in enumerate(views):
+        color, bar = view.color_rgb.copy(), np.zeros_like(view.inside)
+        bar[:, (5 * number) % view.inside.shape[1] :][:, :12] = True
+        color[bar] = (255, 255, 0)
+        painted.append(replace(view, color_rgb=color, colorless=bar))
+    trained, untouched = (train_field(v, FieldConfig(steps=20, pose_rounds=1, rays=1024)) for v in (painted, views))
+    shape = extract_mesh(trained.field, trained.grid)
+    size = np.abs(shape.vertices_m)
+    for axis, red in enumerate(RED_OF_FACE):
+        inner = (size.argmax(1) == axis) & (np.sort(size, axis=1)[:, 1] < HALF_M - 0.006)
+        assert np.median(shape.vertex_rgb[inner, 0]) == pytest.approx(red, abs=12)
+    assert spread_deg(trained.views, views) < spread_deg(untouched.views, views) + 0.1
 
 
 def test_the_same_seed_gives_the_same_field(views):
