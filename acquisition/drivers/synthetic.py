@@ -326,8 +326,6 @@ class _Camera(_Device):
 
     def _stored(self) -> Any:
         """What a fault kept for this read."""
-        if self._held_back is not None and self._again is None:
-            pass
         stored, self._again = self._again, None
         return stored
 

@@ -65,6 +65,20 @@ class Planner:
             "rest on the table; lower the speeds, shorten hold and lead-in, or move the camera away"
         )
 
+    def follow(self, toss: int, swing: Swing) -> Motion:
+        """What happens when the arm does `swing`, wherever that leads. Raises BadInput where the object never rests."""
+        assert self._arm is not None
+        config = self._config.motion
+        free_s = swing.release_s + swing.open_s
+        before, release = self._carry(swing, free_s, generator(self._config.seed, TOSS, toss, 1))
+        after, impact_s, rest_s = self._table.drop(release, free_s, config.longest_free_s, config.rest_s)
+        if not (np.isfinite(impact_s) and np.isfinite(rest_s)):
+            raise BadInput(
+                f"toss {toss}: the object does not come to rest on the table within {config.longest_free_s} s"
+            )
+        instants = Instants(0.0, swing.release_s, impact_s, rest_s, rest_s + config.rest_s)
+        return Motion(toss, before.joined(after), instants, free_s, swing)
+
     def _attempt(self, toss: int, rng: np.random.Generator) -> Motion | None:
         config = self._config.motion
         release = draw_release(self._config, self._body.radius_m, rng)

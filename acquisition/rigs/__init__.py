@@ -1,0 +1,1 @@
+"""Rig files that come with tosslab: copy one and change it."""
