@@ -22,10 +22,12 @@ ACROSS = 13
 STEPS = 8
 NEAREST_TO_CORNER = 0.1
 """Share of the edge left out at either end: there the neighbouring edge is in the picture."""
-SMALLEST_REACH_PX, LARGEST_REACH_PX = 2.0, 7.0
+SMALLEST_REACH_PX, LARGEST_REACH_PX = 1.5, 7.0
 LARGEST_SHIFT = 0.8
 """An edge that moves by more than this share of the reach was not found."""
 LEAST_CONTRAST = 4.0
+WIDEST_STEP = 0.5
+"""A step wider than this share of the reach runs into the pattern's next one: the fit would be drawn to it."""
 FLOOR_PX = 0.05
 """No corner is known better than this: what a lens, a print and a JPEG do besides noise."""
 
@@ -66,7 +68,7 @@ class _Edges:
         center = np.repeat(corners_px.mean(axis=1), 4, axis=0)
         outward *= np.sign(np.einsum("ij,ij->i", outward, middle - center))[:, None]
         width = np.abs(np.einsum("ij,ij->i", outward, middle - center)) * 2
-        reach = np.clip(0.85 * width / cells, SMALLEST_REACH_PX, LARGEST_REACH_PX)
+        reach = np.clip(0.7 * width / cells, SMALLEST_REACH_PX, LARGEST_REACH_PX)
         return _Edges(middle, along, outward, half, reach)
 
 
@@ -97,6 +99,7 @@ def _fit(
     fine = (
         (np.abs(fit[:, 0]) + np.abs(fit[:, 1]) < LARGEST_SHIFT * edges.reach)
         & (contrast > LEAST_CONTRAST)
+        & (np.exp(fit[:, 2]) < WIDEST_STEP * edges.reach)
         & (np.sqrt(variance) < 0.25 * contrast)
     )
     return fit, information, fine

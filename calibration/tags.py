@@ -20,6 +20,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Literal
 
+import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 from numpy import ndarray as Array
@@ -33,6 +34,8 @@ from recordings.records import TagSighting
 FAMILY_CELLS = {"tag36h11": 8, "tag25h9": 7, "tag16h5": 6, "tagStandard41h12": 5, "tagStandard52h13": 6}
 """Side of the square whose corners the detector gives, in cells."""
 Response = Literal["linear", "srgb"]
+Search = Literal["normal", "thorough"]
+"""`thorough` looks in the image enlarged twice: tags down to some 10 px, at four times the time."""
 PUPIL_SHIFT_PX = 0.5
 """The detector counts a pixel's centre as half, OpenCV as whole numbers."""
 CHUNK = 64
@@ -91,6 +94,7 @@ def detect_tags(
     total: int | None = None,
     jobs: int | None = None,
     largest_hamming: int = 1,
+    search: Search = "normal",
 ) -> TagLists:
     """All tags of `family` in grey images.
 
@@ -99,7 +103,7 @@ def detect_tags(
     images a file. `total`: how many images there are, for progress. Images on which the detector dies are tried once
     more in a fresh process, then left empty and listed in `.lost`.
     """
-    settings = _Settings(family, response, largest_hamming)
+    settings = _Settings(family, response, largest_hamming, search)
     done, progress = 0, progress or Silent()
     lists: list[list[TagDetection]] = []
     lost: list[int] = []
@@ -120,6 +124,7 @@ class _Settings:
     family: str
     response: Response
     largest_hamming: int
+    search: Search = "normal"
 
     def __post_init__(self) -> None:
         if self.family not in FAMILY_CELLS:
@@ -251,7 +256,13 @@ class _Pool:
         return None if rows is None else detections(image, rows, self._settings)
 
     def _rows(self, image: UInt8[Array, "h w"], children: dict[float, DetectorChild]) -> Float[Array, "n 11"] | None:
-        decimate = 2.0 if image.size > LARGE_IMAGE_PX else 1.0
+        if self._settings.search == "thorough":
+            return _halved(self._ask(cv2.resize(image, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC), 1.0, children))
+        return self._ask(image, 2.0 if image.size > LARGE_IMAGE_PX else 1.0, children)
+
+    def _ask(
+        self, image: UInt8[Array, "h w"], decimate: float, children: dict[float, DetectorChild]
+    ) -> Float[Array, "n 11"] | None:
         for _ in range(2):
             if decimate not in children:
                 children[decimate] = DetectorChild(self._settings.family, decimate)
@@ -266,6 +277,11 @@ class _Pool:
         for _ in range(self._jobs):
             for child in self._idle.get().values():
                 child.close()
+
+
+def _halved(rows: Float[Array, "n 11"] | None) -> Float[Array, "n 11"] | None:
+    """Corners of the image enlarged twice, in pixels of the image itself (both count a pixel's centre as half)."""
+    return None if rows is None else np.hstack([rows[:, :3], rows[:, 3:] / 2])
 
 
 @contextmanager
