@@ -9,6 +9,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import torch
+
 from processing.segment.xmem_network import XMemNetwork
 from processing.weights import WeightFile, check_layers, find_weights, read_weights
 
@@ -28,8 +30,11 @@ def load_network(folder: Path | None) -> XMemNetwork:
     """The published network with the weights in a user's folder, ready to run. Raises BadInput."""
     path = find_weights(XMEM, folder, OPTION)
     stored = read_weights(path, XMEM)
-    wanted = {n: s for n, s in published_layers().items() if n in stored or not n.endswith(COUNTERS)}
-    check_layers(stored, wanted, path, XMEM)
-    network = XMemNetwork()
-    network.load_state_dict(stored, strict=False)  # all but counters are there: checked above
+    layers = published_layers()
+    counters = {n: torch.zeros((), dtype=torch.int64) for n in layers if n.endswith(COUNTERS)}
+    stored = counters | stored
+    check_layers(stored, layers, path, XMEM)
+    with torch.device("meta"):  # no random numbers for what is replaced at once
+        network = XMemNetwork()
+    network.load_state_dict({n: t.float() if t.is_floating_point() else t for n, t in stored.items()}, assign=True)
     return network.eval()
