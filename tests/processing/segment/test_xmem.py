@@ -40,7 +40,7 @@ GOLDEN = (
     (0.634952, 0.091259, 0.679852, 0.674569),
 )
 """Mean, deviation and two pixels of the probabilities by the published code (hkchengrex/XMem at f3b841d, torch 2.13),
-run once on these weights, frames and memory sizes. Float32 sums in another order differ by 1e-6; 1e-4 leaves room."""
+run once on these weights, frames and memory sizes. Float32 sums in another order differ by 1e-6; 2e-5 leaves room."""
 
 
 def empty(widths: Widths) -> XMemNetwork:
@@ -104,7 +104,7 @@ def test_with_the_same_weights_masks_are_those_of_the_published_code() -> None:
     frames = video(9)
     for i in range(1, 9):
         p = run.follow(frames[i], last=i == 8)
-        np.testing.assert_allclose((p.mean(), p.std(), p[20, 30], p[50, 70]), GOLDEN[i - 1], atol=1e-4)
+        np.testing.assert_allclose((p.mean(), p.std(), p[20, 30], p[50, 70]), GOLDEN[i - 1], atol=2e-5)
     assert run.memory.long_term is not None
     assert len(run.memory.long_term) == 10
 
