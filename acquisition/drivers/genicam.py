@@ -1,0 +1,406 @@
+"""PointGrey/FLIR and any other GigE Vision or USB3 Vision camera, through Aravis.
+
+Spinnaker (PySpin, or rotpy from PyPI) is an alternative for FLIR cameras that this project does not need: Aravis
+speaks the open standards with any vendor's camera, and can be tested without one.
+A free-running camera keeps its own rate; "software" exposes at each `trigger()`; any other trigger names the input
+line ("Line0"), with `strobe_line` the output line that tells the next camera when this one exposes.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import math
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from typing import Any, Self
+
+import numpy as np
+from jaxtyping import UInt8
+from numpy import ndarray as Array
+
+from acquisition.devices import DeviceLost, DeviceRefused, Health, Image, Instant, Stamp
+from acquisition.drivers.aravis import STATUS, Aravis, AravisError, Found
+from acquisition.drivers.inbox import Inbox
+from recordings.errors import DeviceNotFound
+
+POP_US = 100_000
+LEAVE_S = 0.8
+CHUNKS = ("Timestamp", "ExposureTime", "Gain")
+FRAME_ID_BITS = 16
+"""GigE Vision 1 counts frames from 1 to 65535 and starts over at 1."""
+RATE_TOLERANCE = 0.01
+
+
+@dataclass(frozen=True)
+class GenicamSettings:
+    """What is asked of the camera. None leaves the camera's own value."""
+
+    width: int | None = None
+    height: int | None = None
+    offset_x: int = 0
+    offset_y: int = 0
+    rate_hz: float | None = 30.0
+    """Frames per second; without effect while triggered."""
+    exposure_s: float | None = 0.001
+    gain_db: float | None = None
+    trigger: str = "free"
+    """"free", "software", or the name of the input line."""
+    strobe_line: str | None = None
+    """Output line that is high while this camera exposes."""
+    chunks: bool = True
+    """Ask for the timestamp, exposure and gain of each image inside the image, where the camera can."""
+    timestamp_marks: Instant = "exposure_start"
+    """Which moment the camera's timestamp means. Models differ; `toss-calibrate time` finds what remains."""
+    packet_bytes: int | None = None
+    """GigE packet size; None lets Aravis find the largest that gets through."""
+    buffers: int = 16
+
+
+class GenicamCamera:
+    """One grey camera, Mono8. `serial` or `address` (both, to be sure) choose it."""
+
+    def __init__(
+        self,
+        name: str = "mono0",
+        serial: str | None = None,
+        address: str | None = None,
+        settings: GenicamSettings | None = None,
+    ) -> None:
+        self.name = name
+        self._serial, self._address = serial, address
+        self._settings = settings or GenicamSettings()
+        self._aravis: Aravis | None = None
+        self._camera: int | None = None
+        self._grabber: _Grabber | None = None
+        self._keep: Any = None
+        self._found: Found | None = None
+        self._granted: dict[str, Any] = {}
+        self._warnings: list[str] = []
+        self._inbox: Inbox[Image] = Inbox(self._settings.buffers)
+        self._lock = threading.RLock()
+        self._leaving: threading.Thread | None = None
+        self._counts: tuple[dict[str, int], dict[str, int]] = ({}, {})
+
+    def __enter__(self) -> Self:
+        self.open()
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.stop()
+        self.close()
+
+    def open(self) -> None:
+        """Find it and apply the settings. Raises DeviceNotFound (with what was found) or DeviceRefused."""
+        self.close()
+        self._aravis = Aravis.get()
+        self._found = self._choose(self._aravis.found())
+        try:
+            self._camera = self._aravis.call("arv_camera_new", self._found.id)
+        except AravisError as error:
+            raise DeviceNotFound(
+                f"{self.name}: {self._found} does not open: {error}; does another program hold it?"
+            ) from error
+        self._inbox = Inbox(self._settings.buffers)
+        self._warnings = []
+        inbox, what = self._inbox, f"{self.name}: {self._found}"
+        self._keep = self._aravis.on_lost(self._camera, lambda: inbox.lose(f"{what} no longer answers; replug, reopen"))
+        try:
+            self._granted = _apply(self._aravis, self._camera, self._settings, self._warnings)
+        except AravisError as error:
+            self.close()
+            raise DeviceRefused(f"{what} refuses its settings: {error}") from error
+        except DeviceRefused:
+            self.close()
+            raise
+
+    def start(self) -> None:
+        camera = self._opened()
+        assert self._aravis is not None
+        with self._lock:
+            if self._grabber is None:
+                self._inbox.clear()
+                self._grabber = _Grabber(self._aravis, camera, self.name, self._settings, self._granted, self._inbox)
+
+    def stop(self) -> None:
+        with self._lock:
+            grabber, self._grabber = self._grabber, None
+        if grabber is not None:
+            grabber.stop()
+            self._counts = grabber.counts()
+            self._leave(grabber.release)
+
+    def close(self) -> None:
+        self.stop()
+        with self._lock:
+            camera, self._camera = self._camera, None
+        if camera is not None and self._aravis is not None:
+            aravis = self._aravis
+            self._leave(lambda: aravis.call("g_object_unref", camera))
+
+    def read(self, timeout_s: float) -> Image | None:
+        return self._inbox.take(timeout_s)
+
+    def trigger(self) -> None:
+        camera = self._opened()
+        if self._settings.trigger != "software":
+            raise DeviceRefused(
+                f"{self.name} has trigger '{self._settings.trigger}'; set trigger = \"software\" in the rig to do this"
+            )
+        if self._inbox.lost is not None:
+            raise DeviceLost(self._inbox.lost)
+        assert self._aravis is not None
+        self._aravis.call("arv_camera_software_trigger", camera)
+
+    def describe(self) -> dict[str, Any]:
+        assert self._found is not None, "describe() comes after open()"
+        return {
+            "kind": "mono",
+            "model": f"{self._found.vendor} {self._found.model}",
+            "serial": self._found.serial,
+            "firmware": self._granted.get("firmware", ""),
+            "driver": "Aravis 0.8",
+            "address": self._found.address,
+            "protocol": self._found.protocol,
+            "rate_hz": self._granted.get("rate_hz"),
+            "settings": asdict(self._settings) | self._granted,
+            "warnings": list(self._warnings),
+        }
+
+    def health(self) -> Health:
+        received, dropped = self._grabber.counts() if self._grabber else self._counts
+        lost = sum(dropped.values())
+        if self._inbox.lost is not None:
+            return Health("error", self._inbox.lost, received, dropped)
+        return Health("warning" if lost else "ok", f"{lost} frames lost" if lost else "", received, dropped)
+
+    def _leave(self, act: Callable[[], Any]) -> None:
+        """Do what talks to the camera once more, but do not wait: a camera that is gone takes Aravis 5 s to give up."""
+        before = self._leaving
+
+        def run() -> None:
+            if before is not None:
+                before.join()
+            act()
+
+        self._leaving = threading.Thread(target=run, daemon=True)
+        self._leaving.start()
+        self._leaving.join(LEAVE_S)
+
+    def _opened(self) -> int:
+        if self._camera is None:
+            raise DeviceRefused(f"{self.name} is not open; call open() first")
+        return self._camera
+
+    def _choose(self, found: list[Found]) -> Found:
+        fits = [
+            device
+            for device in found
+            if self._serial in (None, device.serial) and self._address in (None, device.address)
+        ]
+        if len(fits) == 1:
+            return fits[0]
+        wanted = " and ".join(
+            f"{key} {value}" for key, value in (("serial", self._serial), ("address", self._address)) if value
+        )
+        seen = "; ".join(str(device) for device in found) or "no camera at all"
+        if fits:
+            raise DeviceNotFound(f"{self.name}: found {seen}; wanted one: name its `serial` in the rig")
+        raise DeviceNotFound(
+            f"{self.name}: found {seen}; wanted {wanted or 'a camera'}; check the cable and the serial in the rig"
+        )
+
+
+def _apply(aravis: Aravis, camera: int, settings: GenicamSettings, warnings: list[str]) -> dict[str, Any]:
+    """Set everything; what the camera granted. Raises AravisError or DeviceRefused."""
+    if settings.width is not None and settings.height is not None:
+        region = (settings.offset_x, settings.offset_y, settings.width, settings.height)
+        aravis.call("arv_camera_set_region", camera, *region)
+    aravis.call("arv_camera_set_pixel_format_from_string", camera, "Mono8")
+    if settings.exposure_s is not None:
+        if aravis.call("arv_camera_is_exposure_auto_available", camera):
+            aravis.call("arv_camera_set_exposure_time_auto", camera, 0)
+        aravis.call("arv_camera_set_exposure_time", camera, settings.exposure_s * 1e6)
+    if settings.gain_db is not None:
+        if aravis.call("arv_camera_is_gain_auto_available", camera):
+            aravis.call("arv_camera_set_gain_auto", camera, 0)
+        aravis.call("arv_camera_set_gain", camera, settings.gain_db)
+    granted: dict[str, Any] = {"exposure_s": aravis.call("arv_camera_get_exposure_time", camera) * 1e-6}
+    _set_trigger(aravis, camera, settings, granted)
+    if aravis.call("arv_camera_is_gv_device", camera):
+        _set_packets(aravis, camera, settings, warnings)
+    granted["chunks"] = settings.chunks and _set_chunks(aravis, camera, warnings)
+    if aravis.call("arv_camera_is_feature_available", camera, "DeviceVersion"):
+        granted["firmware"] = aravis.call("arv_camera_get_string", camera, "DeviceVersion")
+    return granted
+
+
+def _set_trigger(aravis: Aravis, camera: int, settings: GenicamSettings, granted: dict[str, Any]) -> None:
+    if settings.trigger == "free":
+        aravis.call("arv_camera_clear_triggers", camera)
+        if settings.rate_hz is not None:
+            granted["rate_hz"] = _set_rate(aravis, camera, settings.rate_hz)
+    else:
+        source = "Software" if settings.trigger == "software" else settings.trigger
+        try:
+            aravis.call("arv_camera_set_trigger", camera, source)
+        except AravisError as error:
+            raise DeviceRefused(f"the camera has no trigger source '{source}': {error}") from error
+        granted["rate_hz"] = settings.rate_hz
+    if settings.strobe_line is not None:
+        try:
+            for feature, value in (
+                ("LineSelector", settings.strobe_line),
+                ("LineMode", "Output"),
+                ("LineSource", "ExposureActive"),
+            ):
+                aravis.call("arv_camera_set_string", camera, feature, value)
+        except AravisError as error:
+            raise DeviceRefused(f"line '{settings.strobe_line}' cannot tell the exposure: {error}") from error
+
+
+def _set_rate(aravis: Aravis, camera: int, rate_hz: float) -> float:
+    low, high = ctypes.c_double(), ctypes.c_double()
+    aravis.call("arv_camera_get_frame_rate_bounds", camera, ctypes.byref(low), ctypes.byref(high))
+    if rate_hz > high.value > 0:
+        raise DeviceRefused(
+            f"the camera does at most {high.value:.2f} frames/s at this size and exposure, wanted {rate_hz:g}; "
+            "choose a smaller image, a shorter exposure or a lower rate"
+        )
+    aravis.call("arv_camera_set_frame_rate", camera, rate_hz)
+    granted = float(aravis.call("arv_camera_get_frame_rate", camera))
+    if abs(granted - rate_hz) > RATE_TOLERANCE * rate_hz:
+        raise DeviceRefused(f"the camera does {granted:.2f} frames/s, wanted {rate_hz:g}; take a rate it can do")
+    return granted
+
+
+def _set_packets(aravis: Aravis, camera: int, settings: GenicamSettings, warnings: list[str]) -> None:
+    if settings.packet_bytes is not None:
+        aravis.call("arv_camera_gv_set_packet_size", camera, settings.packet_bytes)
+        return
+    size = aravis.call("arv_camera_gv_auto_packet_size", camera)
+    if size < 8000:
+        warnings.append(f"GigE packets of {size} bytes: set the network's MTU to 9000 to lower the load")
+
+
+def _set_chunks(aravis: Aravis, camera: int, warnings: list[str]) -> bool:
+    """Whether images now carry their timestamp, exposure and gain."""
+    if not aravis.call("arv_camera_is_feature_available", camera, "ChunkModeActive"):
+        warnings.append("no chunk data: stamps are the transport's, exposures those that were set")
+        return False
+    try:
+        aravis.call("arv_camera_set_chunks", camera, ",".join(CHUNKS))
+    except AravisError as error:
+        warnings.append(f"chunk data refused ({error}): stamps are the transport's, exposures those that were set")
+        return False
+    return True
+
+
+class _Grabber:
+    """The thread that takes finished buffers from Aravis, copies the image and gives the buffer back."""
+
+    def __init__(
+        self,
+        aravis: Aravis,
+        camera: int,
+        name: str,
+        settings: GenicamSettings,
+        granted: dict[str, Any],
+        inbox: Inbox[Image],
+    ) -> None:
+        self._aravis, self._camera, self._name, self._inbox = aravis, camera, name, inbox
+        self._marks, self._granted = settings.timestamp_marks, granted
+        self._received = self._incomplete = self._gaps = 0
+        self._overflowed_before = inbox.overflowed
+        self._number: int | None = None
+        self._ending = threading.Event()
+        self._stream = aravis.call("arv_camera_create_stream", camera, None, None)
+        payload = aravis.call("arv_camera_get_payload", camera)
+        for _ in range(settings.buffers):
+            aravis.call("arv_stream_push_buffer", self._stream, aravis.call("arv_buffer_new_allocate", payload))
+        self._chunks = aravis.call("arv_camera_create_chunk_parser", camera) if granted["chunks"] else None
+        aravis.call("arv_camera_start_acquisition", camera)
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Take no more images."""
+        self._ending.set()
+        self._thread.join(1.0)
+
+    def release(self) -> None:
+        """Tell the camera to stop, and free the buffers. Slow where the camera is gone."""
+        if self._inbox.lost is None:
+            try:
+                self._aravis.call("arv_camera_stop_acquisition", self._camera)
+            except AravisError as error:  # it went away in this very moment
+                self._inbox.lose(f"{self._name} did not stop: {error}; replug, reopen")
+        for held in (self._chunks, self._stream):
+            if held:
+                self._aravis.call("g_object_unref", held)
+
+    def counts(self) -> tuple[dict[str, int], dict[str, int]]:
+        """Images received whole; images lost as incomplete, in gaps of the frame number, or for want of a reader."""
+        dropped = {
+            f"{self._name}:incomplete": self._incomplete,
+            f"{self._name}:gap": self._gaps,
+            f"{self._name}:overflow": self._inbox.overflowed - self._overflowed_before,
+        }
+        return {self._name: self._received}, {key: count for key, count in dropped.items() if count}
+
+    def _run(self) -> None:
+        while not self._ending.is_set():
+            buffer = self._aravis.call("arv_stream_timeout_pop_buffer", self._stream, POP_US)
+            if buffer is None:
+                continue
+            host_ns = time.monotonic_ns()
+            try:
+                self._take(buffer, host_ns)
+            finally:
+                self._aravis.call("arv_stream_push_buffer", self._stream, buffer)
+
+    def _take(self, buffer: int, host_ns: int) -> None:
+        status = STATUS.get(self._aravis.call("arv_buffer_get_status", buffer), "unknown")
+        if status in ("cleared", "aborted"):
+            return
+        number = self._unwrapped(self._aravis.call("arv_buffer_get_frame_id", buffer))
+        if status != "success":
+            self._incomplete += 1
+            return
+        self._received += 1
+        stamp_ns, exposure_s, gain = self._measured(buffer)
+        stamp = Stamp(f"{self._name}/camera", stamp_ns, instant=self._marks)
+        self._inbox.put(Image("mono", number, stamp, host_ns, self._pixels(buffer), exposure_s, gain))
+
+    def _unwrapped(self, frame_id: int) -> int:
+        """The frame number without the 16-bit counter's restarts; gaps are counted."""
+        if self._number is None:
+            self._number = frame_id
+            return frame_id
+        period = (1 << FRAME_ID_BITS) - 1
+        step = frame_id - self._number if frame_id > 1 << FRAME_ID_BITS else (frame_id - self._number) % period
+        if step > period // 2:  # out of order: an old one came late
+            return self._number + step - period
+        self._gaps += max(0, step - 1)
+        self._number += step
+        return self._number
+
+    def _measured(self, buffer: int) -> tuple[int, float, float]:
+        """Stamp in ns, exposure in s and gain: of the image itself where it carries them."""
+        stamp_ns = self._aravis.call("arv_buffer_get_timestamp", buffer)
+        exposure_s, gain = self._granted["exposure_s"], math.nan
+        if self._chunks and self._aravis.call("arv_buffer_has_chunks", buffer):
+            chunk = (self._chunks, buffer)
+            stamp_ns = self._aravis.call("arv_chunk_parser_get_integer_value", *chunk, "ChunkTimestamp")
+            exposure_s = self._aravis.call("arv_chunk_parser_get_float_value", *chunk, "ChunkExposureTime") * 1e-6
+            gain = self._aravis.call("arv_chunk_parser_get_float_value", *chunk, "ChunkGain")
+        return stamp_ns, exposure_s, gain
+
+    def _pixels(self, buffer: int) -> UInt8[Array, "h w"]:
+        width = self._aravis.call("arv_buffer_get_image_width", buffer)
+        height = self._aravis.call("arv_buffer_get_image_height", buffer)
+        size = ctypes.c_size_t()
+        address = self._aravis.call("arv_buffer_get_data", buffer, ctypes.byref(size))
+        data = (ctypes.c_uint8 * (width * height)).from_address(address)
+        return np.frombuffer(data, dtype=np.uint8).reshape(height, width).copy()
