@@ -8,7 +8,7 @@ plane.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -16,7 +16,7 @@ from numpy import ndarray as Array
 from scipy.spatial.transform import Rotation
 
 from processing.contact.motion import GRAVITY_M_S2, PoseSeries, differences
-from processing.contact.segment import Phases
+from processing.contact.segment import Phases, pose_noise
 from recordings.errors import BadInput
 
 LEAST_FRAMES = 5
@@ -26,6 +26,8 @@ MOST_RATIO = 6.0
 FALL_TOLERANCE = 0.06
 """Relative error of the acceleration of free fall; 0.06 is 3 % of the step or 6 % of the scale."""
 PLANE_TOLERANCE_M = 0.005
+FALL_FRAMES = (20, 14, 10, 7, 5, 4)
+"""Lengths of the windows in which a fall is looked for."""
 SAME_HEIGHT_M = 1e-8
 SAME_FRAMES = 30
 IMPACT_M_S = 0.3
@@ -50,27 +52,56 @@ def check_frames(series: PoseSeries) -> None:
             )
 
 
-def fall_m_s2(tosses: Sequence[PoseSeries], frames: int = 6) -> float | None:
-    """Vertical acceleration of free fall, upwards positive: the median over windows whose motion is a parabola with no
-    sideways acceleration. None where nothing falls."""
-    found = []
-    for series in tosses:
-        for first in range(0, len(series) - frames + 1):
-            t = series.time_s[first : first + frames]
-            p = series.position_m[first : first + frames]
-            fit = np.polynomial.polynomial.polyfit(t - t.mean(), p, 2)
-            left = p - np.polynomial.polynomial.polyval(t - t.mean(), fit).T
-            bend = 2 * fit[2]
-            falls = bend[2] * (t[-1] - t[0]) ** 2 / 8
-            if abs(falls) > 8 * np.abs(left).max() and abs(bend[2]) > 20 * np.abs(bend[:2]).max():
-                found.append(float(bend[2]))
-    return float(np.median(found)) if len(found) >= 3 else None
+@dataclass(frozen=True)
+class Fall:
+    """Vertical acceleration of free fall (m/s^2, upwards positive) and its standard error."""
+
+    value: float
+    error: float
+
+
+def measured_fall(tosses: Sequence[PoseSeries]) -> Fall | None:
+    """The acceleration of free fall: the median over tosses, each by its longest window that is a parabola within its
+    pose noise and has no sideways acceleration. None where fewer than three tosses (or windows) fall."""
+    found = [f for series in tosses for f in _falls(series)]
+    if len(found) < 3:
+        return None
+    values, errors = np.array([f.value for f in found]), np.array([f.error for f in found])
+    return Fall(float(np.median(values)), float(1.25 * np.sqrt((errors**2).mean() / len(found))))
+
+
+def _falls(series: PoseSeries) -> list[Fall]:
+    """At most one fall: of the longest window length that has any, the window with the least misfit."""
+    noise = pose_noise(series).position_m
+    for frames in FALL_FRAMES:
+        windows = [w for i in range(len(series) - frames + 1) if (w := _parabola(series, i, frames, noise))]
+        if windows:
+            return [min(windows, key=lambda w: w[0])[1]]
+    return []
+
+
+def _parabola(series: PoseSeries, first: int, frames: int, noise_m: float) -> tuple[float, Fall] | None:
+    t, p = series.time_s[first : first + frames], series.position_m[first : first + frames]
+    t = t - t.mean()
+    A = np.stack([np.ones_like(t), t, 0.5 * t * t], 1)
+    inverse = np.linalg.inv(A.T @ A)
+    fit = inverse @ A.T @ p
+    left = float(np.sqrt(((p - A @ fit) ** 2).sum() / (3 * max(frames - 3, 1))))
+    error = float(noise_m * inverse[2, 2] ** 0.5)
+    sideways = float(np.abs(fit[2, :2]).max())
+    if left > 2 * noise_m or abs(fit[2, 2]) < 5 * error or sideways > 0.05 * abs(fit[2, 2]) + 3 * error:
+        return None
+    return left, Fall(float(fit[2, 2]), error)
 
 
 def check_fall(tosses: Sequence[PoseSeries]) -> float | None:
-    """The acceleration of free fall. Raises BadInput where it is not gravity's: the step or the scale is wrong."""
-    fall = fall_m_s2(tosses)
-    if fall is None or abs(-fall / GRAVITY_M_S2 - 1) <= FALL_TOLERANCE:
+    """The acceleration of free fall. Raises BadInput where it is not gravity's, beyond its own error: the step or the
+    scale is wrong."""
+    found = measured_fall(tosses)
+    if found is None:
+        return None
+    fall = found.value
+    if abs(fall + GRAVITY_M_S2) <= max(FALL_TOLERANCE * GRAVITY_M_S2, 4 * found.error):
         return fall
     if fall > 0:
         raise BadInput(f"free fall accelerates upwards ({fall:.2f} m/s^2): z of `world` must point up, against gravity")

@@ -96,12 +96,14 @@ def evaluate(
     step_s: float = 1 / 148,
     begin: Literal["first", "release"] = "first",
     against: Sequence[PoseSeries] | None = None,
+    ready: Prepared | None = None,
 ) -> Evaluation:
     """Roll the learned model out from each toss's first frame (or its release) and compare with its track.
 
-    `against`: other poses of the same tosses and the same body (ground truth) to compare with instead.
+    `against`: other poses of the same tosses and the same body (ground truth) to compare with instead. `ready`: the
+    tracks as they were prepared before.
     """
-    prepared = prepared_for(learning, tracks, plane or Plane())
+    prepared = prepared_for(learning, tracks, plane or Plane()) if ready is None else ready
     start, first = _from(prepared, begin)
     return evaluate_from(learning, prepared, start, first, steps, step_s, against, plane or Plane())
 

@@ -27,6 +27,9 @@ LOSS_SCALE = 1e4
 """Brings the loss (J) to order one for the optimisers' tolerances."""
 TOLERANCE, ROUGH_TOLERANCE = 1e-7, 3e-6
 """L-BFGS ends when the loss falls by less than this, relatively; rough for fits that only compare."""
+HOLD_J = 3e-4
+"""What a transition's loss varies by for no reason of the shape's (the loss of well fitted tosses is of this size): so
+much a move by one sigma of the prior costs in the sum over transitions."""
 MOST_MOVE, MOST_FRICTION = 1.5, 2.0
 """How far a parameter may go from its start (a length: 75 mm): a first step of L-BFGS knows no scale."""
 
@@ -47,6 +50,8 @@ class FitConfig:
     """For free points, with a cosine schedule."""
     adam_rate: float = 0.025
     """In units of SCALE_M: the largest move of a coordinate in one iteration."""
+    held_rate: float = 0.01
+    """The same where a prior holds the points: they start near the optimum."""
     device: str = "cpu"
     """`cpu` or `cuda`; always in float64."""
 
@@ -58,6 +63,8 @@ class Model:
     geometry: Geometry
     inertia_start_kgm2: Float[Array, "3 3"]
     config: FitConfig
+    sigma_m: Float[Array, " v"] | None = None
+    """Free points that a prior holds: how far each may be off. None: nothing holds them."""
 
     def __post_init__(self) -> None:
         if self.config.learn_plane and self.config.learn_shape:
@@ -93,6 +100,15 @@ class Model:
         with torch.no_grad():
             return self.body(torch.as_tensor(parameters, dtype=torch.float64, device=self.config.device))
 
+    def hold(self, parameters: Float[Tensor, " p"], transitions: int) -> Float[Tensor, ""]:
+        """HOLD_J / transitions * sum |move|^2 / (2 sigma^2), in J: the prior's share of the mean loss."""
+        if self.sigma_m is None:
+            return parameters.new_zeros(())
+        start = torch.as_tensor(self.geometry.start(), dtype=parameters.dtype, device=parameters.device)
+        sigma = torch.as_tensor(self.sigma_m, dtype=parameters.dtype, device=parameters.device)
+        move = SCALE_M * (parameters[SHAPE] - start).view(-1, 3)
+        return HOLD_J / max(transitions, 1) * 0.5 * (move.square().sum(-1) / sigma.square()).sum()
+
     def loss(self, parameters: Float[Tensor, " p"], data: StepData, weights: Weights) -> LossValue:
         idle = self.config.learn_inertia or self.config.learn_center
         return contact_loss(data, self.body(parameters), self.geometry.contacts, weights, idle_gradient=idle)
@@ -127,7 +143,7 @@ class _Objective:
     def __call__(self) -> Float[Tensor, ""]:
         value = self.model.loss(self.parameters(), self.data, self.weights)
         self.free.grad = None
-        scaled = value.loss * LOSS_SCALE
+        scaled = (value.loss + self.model.hold(self.parameters(), len(self.data))) * LOSS_SCALE
         if scaled.requires_grad:
             scaled.backward()
         self.evaluations += 1
@@ -207,4 +223,5 @@ def fit(model: Model, start: Float[Array, " p"], data: StepData, weights: Weight
         tolerance = TOLERANCE if share == 1.0 else ROUGH_TOLERANCE
         return fit_lbfgs(model, start, data, weights, max(4, round(config.lbfgs_iterations * share)), tolerance)
     iterations = max(8, round(config.adam_iterations * share))
-    return fit_adam(model, start, data, weights, iterations, config.adam_rate * (1.0 if share == 1.0 else 0.3))
+    rate = config.adam_rate if model.sigma_m is None else config.held_rate
+    return fit_adam(model, start, data, weights, iterations, rate * (1.0 if share == 1.0 else 0.3))

@@ -101,8 +101,9 @@ def hull_of(vertices_m: Float[Array, "v 3"], count: int = 64) -> FreePoints:
     return FreePoints(points, (tuple(range(len(points))),))
 
 
-def support_points(vertices_m: Float[Array, "v 3"], count: int) -> Float[Array, "n 3"]:
-    """At most `count` of the hull's vertices: greedily those that the hull of the others misses most.
+def support_points(vertices_m: Float[Array, "v 3"], count: int, missing_m: float = 0.0) -> Float[Array, "n 3"]:
+    """At most `count` of the hull's vertices: greedily those that the hull of the others misses most, until it misses
+    less than `missing_m`: several points in each corner would leave no candidates for the other corners of a face.
 
     Raises BadInput for vertices that span no volume.
     """
@@ -110,17 +111,20 @@ def support_points(vertices_m: Float[Array, "v 3"], count: int) -> Float[Array, 
     if len(vertices) < 4 or np.linalg.matrix_rank(vertices - vertices.mean(0), tol=1e-6) < 3:
         raise BadInput(f"a shape of {len(vertices_m)} vertices spans no volume; wanted at least 4 not in one plane")
     hull = vertices[ConvexHull(vertices).vertices]
-    if len(hull) <= count:
+    if len(hull) <= count and missing_m == 0:
         return hull
     directions = sphere_directions(20 * count)
     reach = directions @ hull.T
-    chosen = list(dict.fromkeys(int(i) for i in reach[:: 20 * count // 6].argmax(1)))
+    farthest, whole = reach.argmax(1), reach.max(1)
+    chosen = list(dict.fromkeys(int(i) for i in farthest[:: 20 * count // 6]))
+    covered = reach[:, chosen].max(1)
     while len(chosen) < count:
-        missing = (reach.max(1) - reach[:, chosen].max(1)).argmax()
-        best = int(reach[missing].argmax())
-        if best in chosen:
+        worst = (whole - covered).argmax()
+        best = int(farthest[worst])
+        if best in chosen or whole[worst] - covered[worst] < missing_m:
             break
         chosen.append(best)
+        covered = np.maximum(covered, reach[:, best])
     return hull[chosen]
 
 

@@ -35,6 +35,8 @@ class Plane:
     normal_world: Float[Array, "3"] = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
     offset_m: float = 0.0
     source: str = "z = 0 of world"
+    std_m: float | None = None
+    """Standard deviation of the height, where the calibration says it."""
 
     def level_from_world(self) -> Float[Array, "3 3"]:
         """The rotation that turns the normal to z by the shortest way."""
@@ -54,6 +56,9 @@ class ContactConfig:
     sweep: SweepConfig = field(default_factory=SweepConfig)
     weights: Weights | None = None
     """None: chosen by held-out rollouts (SweepConfig). `Weights()` are the paper's."""
+    penetration: float = 1.0
+    """Weight of the fourth term where the weights are chosen. 1 is the paper's; free points of a vision mesh at 30 Hz
+    want Vysics' 20, else single corners reach through the plane to meet an impact between two frames."""
     one_toss_dissipation: float = 30.0
     """Of a single toss, from which nothing can be held out."""
     bootstrap_repeats: int = 16
@@ -62,6 +67,15 @@ class ContactConfig:
     smooth: bool = True
     """False: raw differences of the poses."""
     seed: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """Tosses that can be learned from: about the centre of mass, in a world whose plane is z = 0."""
+
+    tracks: tuple[PoseSeries, ...]
+    smoothed: tuple[Smoothed, ...]
+    left_out: Mapping[int, str]
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,6 +103,8 @@ class ContactLearning:
     plane_sensitivity: Mapping[str, float]
     checks: Mapping[str, float | None]
     noise: Mapping[int, tuple[float, float]]
+    prepared: Prepared
+    data: StepData
     cpu_seconds: float
     seconds: float
 
@@ -100,15 +116,6 @@ class ContactLearning:
     def body(self) -> Body:
         """The learned body about the prior's centre of mass, for rollouts."""
         return self.fitted.numbers(self.fit.parameters)
-
-
-@dataclass(frozen=True, eq=False)
-class Prepared:
-    """Tosses that can be learned from: about the centre of mass, in a world whose plane is z = 0."""
-
-    tracks: tuple[PoseSeries, ...]
-    smoothed: tuple[Smoothed, ...]
-    left_out: Mapping[int, str]
 
 
 def prepare(tracks: Sequence[PoseSeries], frame: Frame, plane: Plane, inertia: Float[Array, "3 3"]) -> Prepared:
@@ -159,12 +166,12 @@ def learn_contact(
     began = time.perf_counter()
     plane, config, progress = plane or Plane(), config or ContactConfig(), progress or Silent()
     inertia = REFERENCE_MASS_KG / physics.mass_kg * prior.frame.inertia(physics.inertia_kgm2)
-    fitted = Model(prior.geometry, inertia, config.fit)
+    fitted = Model(prior.geometry, inertia, config.fit, prior.sigma_m)
     groups = checks.duplicate_groups(tracks)
     again = {t for group in groups for t in group[1:]}
     prepared = prepare([t for t in tracks if t.toss not in again], prior.frame, plane, inertia)
     found = _check_together(tracks, prepared, prior, inertia, fitted)
-    steps = _steps(prepared, config)
+    steps = transitions(prepared, config.smooth)
     _require_contact(fitted, steps, prepared)
     progress.step(1, 6, "data checked")
     sweep, weights = _choose_weights(fitted, steps, prepared, config, progress)
@@ -185,7 +192,7 @@ def learn_contact(
     body = fitted.numbers(optimum)
     touched = touched_points(fitted, body, data, weights)
     _check_learned_plane(prepared, body)
-    model, shape, friction, sizes = _results(fitted, optimum, spread, prior, physics, plane, touched)
+    model, shape, friction, sizes = results_of(fitted, optimum, spread, prior, physics, plane, touched)
     left_out = {**prepared.left_out, **dict.fromkeys(sorted(again), "the same recording as another toss")}
     progress.step(6, 6, "learned")
     return ContactLearning(
@@ -210,6 +217,8 @@ def learn_contact(
         plane_sensitivity=sensitivity,
         checks=found,
         noise={s.states.toss: (s.noise.position_m, s.noise.rotation_rad) for s in prepared.smoothed},
+        prepared=prepared,
+        data=data,
         cpu_seconds=cpu_seconds,
         seconds=time.perf_counter() - began,
     )
@@ -243,11 +252,11 @@ def _check_learned_plane(prepared: Prepared, body: Body) -> None:
     checks.check_plane(_rest_heights(prepared, body.points_m.cpu().numpy()), "the learned shape")
 
 
-def _steps(prepared: Prepared, config: ContactConfig) -> Steps:
+def transitions(prepared: Prepared, smoothed: bool = True) -> Steps:
     """Transitions from the release on: what a hand does is not learned."""
     from processing.contact.motion import differences
 
-    states = [s.states if config.smooth else differences(t) for t, s in zip(prepared.tracks, prepared.smoothed)]
+    states = [s.states if smoothed else differences(t) for t, s in zip(prepared.tracks, prepared.smoothed)]
     steps = steps_of(states)
     release = {s.states.toss: s.phases.release or 0 for s in prepared.smoothed}
     begin = np.array([release[t] for t in steps.toss.tolist()])
@@ -271,13 +280,18 @@ def _choose_weights(
     if config.weights is not None:
         return None, config.weights
     if len(prepared.tracks) < 3:
-        return None, Weights(dissipation=config.one_toss_dissipation)
+        return None, Weights(dissipation=config.one_toss_dissipation, penetration=config.penetration)
     start, begin = starts(prepared)
     held_out = HeldOut(prepared.tracks, start, begin, config.rollout_steps, config.rollout_step_s)
     sweep = sweep_weights(
-        fitted, steps, held_out, config.sweep, lambda done, total: progress.step(1, 6, f"weights {done}/{total}")
+        fitted,
+        steps,
+        held_out,
+        config.sweep,
+        lambda done, total: progress.step(1, 6, f"weights {done}/{total}"),
+        Weights(penetration=config.penetration),
     )
-    return sweep, Weights(dissipation=sweep.chosen.dissipation)
+    return sweep, Weights(dissipation=sweep.chosen.dissipation, penetration=config.penetration)
 
 
 def _spread(
@@ -335,7 +349,7 @@ def _by_toss(steps: Steps, odd: Bool[Array, " n"]) -> dict[int, tuple[int, ...]]
     return {toss: tuple(frames) for toss, frames in found.items()}
 
 
-def _results(
+def results_of(
     fitted: Model,
     optimum: Float[Array, " p"],
     spread: Spread,
@@ -344,6 +358,7 @@ def _results(
     plane: Plane,
     touched: Bool[Array, " v"],
 ) -> tuple[ContactModel, ObjectShape, Interval, tuple[Interval, ...]]:
+    """What a parameter vector stands for, in the object frame, with its intervals."""
     body = fitted.numbers(optimum)
     points = body.points_m.cpu().numpy()
     mu = float(body.friction)

@@ -9,6 +9,7 @@ from scipy.interpolate import RBFInterpolator
 from scipy.spatial import ConvexHull
 
 from processing.contact.geometry import FreePoints, support_points
+from processing.contact.support import trimmed_hull
 
 MOST_PIECES = 8
 GOOD_ENOUGH = 0.97
@@ -17,16 +18,22 @@ CUTS = 9
 """Planes tried per axis."""
 LEAST_GAIN = 0.01
 """Share of the mesh's volume that a cut must save."""
+MOST_FACES = 2500
+"""A finer mesh is made coarser before it is cut."""
 
 
-def convex_pieces(vertices_m: Float[Array, "v 3"], faces: Int[Array, "f 3"], points: int = 64) -> FreePoints:
+def convex_pieces(
+    vertices_m: Float[Array, "v 3"], faces: Int[Array, "f 3"], points: int = 64, cap_m2: float = 0.0
+) -> FreePoints:
     """Cut a mesh by planes along its principal axes until the pieces' hulls are nearly the mesh.
 
     Greedy: the cut of any piece that leaves the least total hull volume. `points` is the most support points of all
-    pieces together. Only the pieces' hulls are wanted, so cuts are left open.
+    pieces together; `cap_m2` above 0 trims the pieces' spikes. Only the hulls are wanted, so cuts are left open.
     """
     import trimesh
 
+    if len(faces) > MOST_FACES:
+        vertices_m, faces = _coarser(vertices_m, faces)
     mesh = trimesh.Trimesh(vertices_m, faces, process=True)
     box_from_mesh, _ = trimesh.bounds.oriented_bounds(mesh)
     axes, filled = np.asarray(box_from_mesh)[:3, :3], abs(float(mesh.volume))
@@ -37,10 +44,25 @@ def convex_pieces(vertices_m: Float[Array, "v 3"], faces: Int[Array, "f 3"], poi
             break
         parts[at : at + 1] = halves
     each = max(8, points // len(parts))
-    found = [support_points(p.reshape(-1, 3), each) for p in parts]
+    found = [support_points(p.reshape(-1, 3), each) if cap_m2 == 0 else _trimmed(p, each, cap_m2) for p in parts]
     ends = np.cumsum([len(p) for p in found])
     groups = tuple(tuple(range(int(e) - len(p), int(e))) for p, e in zip(found, ends))
     return FreePoints(np.concatenate(found), groups)
+
+
+def _coarser(
+    vertices_m: Float[Array, "v 3"], faces: Int[Array, "f 3"]
+) -> tuple[Float[Array, "w 3"], Int[Array, "g 3"]]:
+    import open3d as o3d
+
+    mesh = o3d.geometry.TriangleMesh(o3d.utility.Vector3dVector(vertices_m), o3d.utility.Vector3iVector(faces))
+    mesh = mesh.simplify_quadric_decimation(MOST_FACES)
+    return np.asarray(mesh.vertices), np.asarray(mesh.triangles, dtype=np.int64)
+
+
+def _trimmed(triangles: Float[Array, "t 3 3"], points: int, cap_m2: float) -> Float[Array, "p 3"]:
+    vertices = triangles.reshape(-1, 3)
+    return trimmed_hull(vertices, np.arange(len(vertices)).reshape(-1, 3), points, cap_m2)
 
 
 def _hull_volume(triangles: Float[Array, "t 3 3"]) -> float:
@@ -73,17 +95,17 @@ def _above(triangles: Float[Array, "t 3 3"], axis: Float[Array, "3"], level: flo
     """The part of the triangles with axis . x >= level, triangulated."""
     heights = triangles @ axis - level
     kept = [triangles[(heights >= 0).all(1)]]
-    for triangle, height in zip(triangles, heights):
-        if (height > 1e-9).any() and (height < -1e-9).any():
-            polygon = []
-            for i in range(3):
-                j = (i + 1) % 3
-                if height[i] >= 0:
-                    polygon.append(triangle[i])
-                if (height[i] > 0) != (height[j] > 0):
-                    share = height[i] / (height[i] - height[j])
-                    polygon.append(triangle[i] + share * (triangle[j] - triangle[i]))
-            kept += [np.array([[polygon[0], polygon[k], polygon[k + 1]]]) for k in range(1, len(polygon) - 1)]
+    crossing = (heights > 1e-9).any(1) & (heights < -1e-9).any(1)
+    for triangle, height in zip(triangles[crossing], heights[crossing]):
+        polygon = []
+        for i in range(3):
+            j = (i + 1) % 3
+            if height[i] >= 0:
+                polygon.append(triangle[i])
+            if (height[i] > 0) != (height[j] > 0):
+                share = height[i] / (height[i] - height[j])
+                polygon.append(triangle[i] + share * (triangle[j] - triangle[i]))
+        kept += [np.array([[polygon[0], polygon[k], polygon[k + 1]]]) for k in range(1, len(polygon) - 1)]
     return np.concatenate(kept)
 
 

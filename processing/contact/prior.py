@@ -11,6 +11,7 @@ from numpy import ndarray as Array
 from processing.contact.geometry import Box, FreePoints, Geometry, GeometryName, hull_mesh, hull_of, sphere
 from processing.contact.inertia import Physics
 from processing.contact.motion import PoseSeries
+from processing.contact.support import trimmed_hull, trimmed_vertices
 from recordings.tracks import ObjectShape
 
 
@@ -49,6 +50,8 @@ class Prior:
     measured: bool
     object_frame: str = "object"
     mesh: ObjectShape | None = None
+    sigma_m: Float[Array, " v"] | None = None
+    """How far each point may be off (standard deviation), where the prior is to hold its points; None: not at all."""
 
 
 def prior_from_size(geometry: GeometryName, side_m: float, center_m: Float[Array, "3"] | None = None) -> Prior:
@@ -59,22 +62,31 @@ def prior_from_size(geometry: GeometryName, side_m: float, center_m: Float[Array
 
 
 def prior_from_shape(
-    geometry: GeometryName, shape: ObjectShape, physics: Physics, points: int = 64, contacts: int = 10
+    geometry: GeometryName,
+    shape: ObjectShape,
+    physics: Physics,
+    points: int = 64,
+    contacts: int = 10,
+    cap_m2: float = 0.0,
 ) -> Prior:
-    """Start from a mesh: its oriented bounding box, its convex hull, or its convex pieces."""
+    """Start from a mesh: its oriented bounding box, its convex hull, or its convex pieces.
+
+    `cap_m2` above 0 (support.CAP_M2) trims the spikes of a measured mesh first.
+    """
     center = physics.center_of_mass_m
     if geometry == "box":
-        axes, middle, half = _oriented_box(shape.vertices_m)
+        around = shape.vertices_m if cap_m2 == 0 else trimmed_vertices(shape.vertices_m, shape.faces, cap_m2)
+        axes, middle, half = _oriented_box(around)
         return Prior(Box(half), Frame(axes, middle), True, shape.object_frame, shape)
     frame = Frame(np.eye(3), center)
     local = frame.inside(shape.vertices_m)
     free: FreePoints
     if geometry == "hull":
-        free = hull_of(local, points)
+        free = hull_of(local if cap_m2 == 0 else trimmed_hull(local, shape.faces, points, cap_m2), points)
     else:
         from processing.contact.pieces import convex_pieces
 
-        free = convex_pieces(local, shape.faces, points)
+        free = convex_pieces(local, shape.faces, points, cap_m2)
     free = FreePoints(free.points_m, free.groups, contacts)
     return Prior(free, frame, True, shape.object_frame, shape)
 

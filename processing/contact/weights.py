@@ -83,6 +83,7 @@ def sweep_weights(
     held_out: HeldOut,
     config: SweepConfig,
     told: Callable[[int, int], None] = lambda done, total: None,
+    base: Weights | None = None,
 ) -> Sweep:
     """Search the grid: the first candidates, then those beside the best until no better neighbour is left."""
     found: list[Candidate] = []
@@ -91,7 +92,7 @@ def sweep_weights(
     while todo:
         near = min(found, key=lambda c: abs(np.log(c.dissipation / todo[0])), default=None)
         begin = model.start() if near is None else near.fit.parameters
-        found.append(_try(model, steps, held_out, config, todo.pop(0), begin, first=near is None))
+        found.append(_try(model, steps, held_out, config, todo.pop(0), begin, near is None, base))
         told(len(found), len(grid))
         if not todo:
             best = min(found, key=lambda c: float(c.error_m.mean()))
@@ -124,8 +125,9 @@ def _try(
     dissipation: float,
     begin: Float[Array, " p"],
     first: bool,
+    base: Weights | None,
 ) -> Candidate:
-    weights = replace(Weights(), dissipation=dissipation)
+    weights = replace(base or Weights(), dissipation=dissipation)
     device = model.config.device
     whole = fit(model, begin, StepData(steps, device), weights, 1.0 if first else config.share)
     tosses = [t.toss for t in held_out.tracks]
