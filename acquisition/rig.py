@@ -34,6 +34,8 @@ class DeviceEntry:
     serial: str = ""
     """The device's serial number (or address, for a robot); empty: the only one there is."""
     rate_hz: float = 30.0
+    latency_ms: float = 0.0
+    """Smallest time from an instant to its receipt, where it is known: it is taken off the stamps."""
     settings: Mapping[str, Any] = field(default_factory=dict)
 
 

@@ -1,3 +1,4 @@
+# long because: the writers of a toss, of a session and of its truth share their documents
 """Writing a session: one complete MCAP file per toss, a start and a stop document, sha256 of every file."""
 
 from __future__ import annotations
@@ -5,6 +6,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import threading
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -34,7 +36,7 @@ def toss_name(toss: int) -> str:
 
 class TossWriter:
     """One file of a session, complete in itself. As a context: finished on a clean exit and on Ctrl-C (its stop record
-    then says `interrupted`), left recoverable after an error."""
+    then says `interrupted`), left recoverable after an error. Each stream may be written by a thread of its own."""
 
     def __init__(
         self, path: Path, start: Mapping[str, Any], calibration: RigCalibration, kind: str, info: Mapping[str, Any]
@@ -47,7 +49,8 @@ class TossWriter:
         self._schemas: dict[Any, int] = {}
         self._sizes: dict[str, tuple[int, int]] = {}
         self._dropped: dict[str, int] = {}
-        self._arm_samples = 0
+        self._joint_samples: dict[str, int] = {}
+        self._lock = threading.RLock()
         self._ended = False
         self._begun = False
         self._writer.metadata(
@@ -88,15 +91,22 @@ class TossWriter:
         payload = codec.encode_depth(image)
         self._put(topic, payload, image.host_time_ns, image.time_ns, image.index, {"unit_m": repr(image.unit_m)})
 
-    def arm(self, states: ArmStates) -> None:
-        """A batch of samples, as the arm's driver delivers them; `sequence` counts on over the batches of the toss."""
+    def arm(self, states: ArmStates, host_time_ns: Sequence[int] | None = None, topic: str = arm_codec.TOPIC) -> None:
+        """A batch of samples, as the arm's driver delivers them; `sequence` counts on over the batches of the toss.
+
+        `host_time_ns`: when the host received each sample; by default its own time.
+        """
         if len(states.time_ns) == 0:
             return
-        self._begin(int(states.time_ns[0]))
-        channel = self._channel(arm_codec.TOPIC, JointStates, None)
-        for time_ns, data in zip(states.time_ns.tolist(), arm_codec.encode_arm(states), strict=True):
-            self._writer.message(channel, time_ns, time_ns, self._arm_samples, data)
-            self._arm_samples += 1
+        times_ns = states.time_ns.tolist()
+        received_ns = times_ns if host_time_ns is None else list(host_time_ns)
+        self._begin(received_ns[0])
+        channel = self._channel(topic, JointStates, None)
+        first = self._joint_samples.get(topic, 0)
+        messages = zip(received_ns, times_ns, arm_codec.encode_arm(states), strict=True)
+        for number, (host_ns, time_ns, data) in enumerate(messages, first):
+            self._writer.message(channel, host_ns, time_ns, number, data)
+        self._joint_samples[topic] = first + len(times_ns)
 
     def command(self, command: TossCommand) -> None:
         self._put("/toss/command", codec.encode_command(command), command.time_ns, command.time_ns, 0)
@@ -177,12 +187,14 @@ class TossWriter:
         self._writer.message(channel, host_ns, time_ns, index, payload.data, compress=payload.compress)
 
     def _channel(self, topic: str, schema: Any, metadata: Mapping[str, str] | None) -> int:
-        if topic not in self._channels:
-            if schema not in self._schemas:
-                name = schema.DESCRIPTOR.full_name
-                self._schemas[schema] = self._writer.schema(name, "protobuf", codec.schema_descriptor(schema))
-            self._channels[topic] = (self._writer.channel(topic, "protobuf", self._schemas[schema], metadata), schema)
-        number, first = self._channels[topic]
+        with self._lock:
+            if topic not in self._channels:
+                if schema not in self._schemas:
+                    name = schema.DESCRIPTOR.full_name
+                    self._schemas[schema] = self._writer.schema(name, "protobuf", codec.schema_descriptor(schema))
+                made = self._writer.channel(topic, "protobuf", self._schemas[schema], metadata)
+                self._channels[topic] = (made, schema)
+            number, first = self._channels[topic]
         if first is not schema:
             raise BadInput(
                 f"{topic}: {schema.DESCRIPTOR.full_name} after {first.DESCRIPTOR.full_name}; one encoding per toss"
@@ -191,9 +203,12 @@ class TossWriter:
 
     def _begin(self, time_ns: int) -> None:
         """Camera models and static transforms go first, at the time of the first message."""
-        if self._begun:
-            return
-        self._begun = True
+        with self._lock:
+            if not self._begun:
+                self._begun = True
+                self._send_calibration(time_ns)
+
+    def _send_calibration(self, time_ns: int) -> None:
         transforms = list(self._calibration.transforms)
         for name, camera in self._calibration.cameras.items():
             topic = (
