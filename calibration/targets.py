@@ -1,0 +1,169 @@
+"""Calibration targets: AprilTag grid, ChArUco board, chessboard. What they look like and where an image shows them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+from numpy import ndarray as Array
+
+from calibration.tags import Response, TagDetection, detect_tags
+from recordings.errors import BadInput
+from recordings.progress import Progress
+
+CORNERS = 0.5 * np.array([[-1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [-1.0, -1.0, 0.0]])
+"""Of a tag of side 1 in its own frame (x right, y down, z into the paper), in the detector's order."""
+CORNER_SIGMA_PX = 0.1
+"""Of a chessboard's corner: OpenCV gives none."""
+
+
+@dataclass(frozen=True, eq=False)
+class Tags:
+    """AprilTags at known places of a board (or of any body): `board_from_tag` by id, 4x4."""
+
+    family: str
+    size_m: Mapping[int, float]
+    board_from_tag: Mapping[int, Float[Array, "4 4"]]
+
+    def corners_m(self, tag_id: int) -> Float[Array, "4 3"]:
+        place = self.board_from_tag[tag_id]
+        return self.size_m[tag_id] * CORNERS @ place[:3, :3].T + place[:3, 3]
+
+
+@dataclass(frozen=True)
+class Charuco:
+    """A chessboard of columns x rows squares with markers in the white ones (OpenCV's CharucoBoard).
+
+    The board's frame is OpenCV's: origin at the first square's outer corner, x along the columns, z into the board.
+    `dictionary` by OpenCV's name, for instance DICT_5X5_100; `legacy`: the pattern of OpenCV before 4.6.
+    """
+
+    columns: int
+    rows: int
+    square_m: float
+    marker_m: float
+    dictionary: str = "DICT_5X5_100"
+    legacy: bool = False
+
+
+@dataclass(frozen=True)
+class Chessboard:
+    """A plain chessboard, counted in inner corners. It must be seen whole; columns and rows must differ, and one of
+    them be odd and the other even, or the board reads the same upside down."""
+
+    columns: int
+    rows: int
+    square_m: float
+
+
+Target = Tags | Charuco | Chessboard
+
+
+@dataclass(frozen=True, eq=False)
+class TargetView:
+    """A target in one image: numbers of its points, where they are on the board, in the image, and how surely."""
+
+    ids: Int[Array, " n"]
+    points_m: Float[Array, "n 3"]
+    pixels: Float[Array, "n 2"]
+    covariance_px2: Float[Array, "n 2 2"]
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+
+NOTHING = TargetView(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 2)), np.zeros((0, 2, 2)))
+
+
+def find_target(
+    target: Target,
+    images: Sequence[UInt8[Array, "h w"]],
+    response: Response = "linear",
+    cache: Path | None = None,
+    progress: Progress | None = None,
+) -> list[TargetView]:
+    """The target in every image; views without points where it is not seen."""
+    if isinstance(target, Tags):
+        lists = detect_tags(images, target.family, cache, progress, response=response, total=len(images))
+        return [tag_view(target, tags) for tags in lists]
+    if isinstance(target, Charuco):
+        return _find_charuco(target, images)
+    return [_find_chessboard(target, image) for image in images]
+
+
+def tag_view(target: Tags, found: Sequence[TagDetection]) -> TargetView:
+    """The target's own tags among those found. A tag seen twice in one image is left out: one of them is wrong."""
+    ids = [t.tag_id for t in found]
+    mine = [t for t in found if t.tag_id in target.board_from_tag and ids.count(t.tag_id) == 1]
+    if not mine:
+        return NOTHING
+    return TargetView(
+        np.concatenate([4 * t.tag_id + np.arange(4) for t in mine]),
+        np.concatenate([target.corners_m(t.tag_id) for t in mine]),
+        np.concatenate([t.corners_px for t in mine]),
+        np.concatenate([t.covariance_px2 for t in mine]),
+    )
+
+
+def _find_charuco(target: Charuco, images: Sequence[UInt8[Array, "h w"]]) -> list[TargetView]:
+    import cv2
+
+    name = getattr(cv2.aruco, target.dictionary, None)
+    if name is None:
+        raise BadInput(f"unknown marker dictionary '{target.dictionary}'; wanted one of OpenCV's, e.g. DICT_5X5_100")
+    board = cv2.aruco.CharucoBoard(
+        (target.columns, target.rows), target.square_m, target.marker_m, cv2.aruco.getPredefinedDictionary(name)
+    )
+    board.setLegacyPattern(target.legacy)
+    detector, corners_m = cv2.aruco.CharucoDetector(board), np.array(board.getChessboardCorners(), dtype=np.float64)
+    views = []
+    for image in images:
+        pixels, ids, _, _ = detector.detectBoard(image)
+        if ids is None or len(ids) < 4:
+            views.append(NOTHING)
+            continue
+        ids = ids.ravel().astype(np.int64)
+        views.append(TargetView(ids, corners_m[ids], pixels.reshape(-1, 2).astype(np.float64), _plain(len(ids))))
+    return views
+
+
+def _find_chessboard(target: Chessboard, image: UInt8[Array, "h w"]) -> TargetView:
+    import cv2
+
+    found, pixels = cv2.findChessboardCornersSB(image, (target.columns, target.rows), None, cv2.CALIB_CB_ACCURACY)
+    if not found:
+        return NOTHING
+    y, x = np.divmod(np.arange(target.columns * target.rows), target.columns)
+    points_m = target.square_m * np.stack([x, y, np.zeros_like(x)], -1).astype(np.float64)
+    return TargetView(np.arange(len(x)), points_m, pixels.reshape(-1, 2).astype(np.float64), _plain(len(x)))
+
+
+def _plain(count: int) -> Float[Array, "n 2 2"]:
+    return np.tile(CORNER_SIGMA_PX**2 * np.eye(2), (count, 1, 1))
+
+
+def target_from_document(document: Mapping[str, Any], where: str) -> Target:
+    """A session's `board`: AprilTags {family, tags: [{id, size_m, T_board_tag}]}, or {kind: charuco, columns, rows,
+    square_m, marker_m, dictionary} or {kind: chessboard, columns, rows, square_m}. Raises BadInput."""
+    try:
+        kind = document.get("kind", "tags" if "tags" in document else None)
+        if kind == "tags":
+            tags = list(document["tags"])
+            return Tags(
+                str(document.get("family", "tag36h11")),
+                {int(t["id"]): float(t["size_m"]) for t in tags},
+                {int(t["id"]): np.array(t["T_board_tag"], dtype=np.float64) for t in tags},
+            )
+        sizes = (int(document["columns"]), int(document["rows"]), float(document["square_m"]))
+        if kind == "charuco":
+            dictionary = str(document.get("dictionary", "DICT_5X5_100"))
+            return Charuco(*sizes, float(document["marker_m"]), dictionary, bool(document.get("legacy", False)))
+        if kind == "chessboard":
+            return Chessboard(*sizes)
+    except (KeyError, TypeError, ValueError) as wrong:
+        raise BadInput(f"{where}: the calibration board: {type(wrong).__name__} {wrong}; see README.md") from wrong
+    raise BadInput(f"{where}: a calibration board of kind {kind!r}; wanted tags, charuco or chessboard")
