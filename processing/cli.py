@@ -5,20 +5,21 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from importlib import import_module
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from processing.variants import CONTACT_ONLY, NAMES, TRACKERS, default_name, find_variant
+from processing.variants import CONTACT_ONLY, DEFAULT, NAMES, TRACKERS, rows_of
 from recordings.console import Outcome, Parser, command_parser, progress_for, run_command
 from recordings.errors import BadInput, TosslabError
 
 if TYPE_CHECKING:
+    from processing.config import Config
     from recordings.session import Session
 
 SAMPLE = "sample"
 SAMPLE_FOLDER = Path("samples") / "box_toss"
 CONTACT = "processing.contact.command"
+BASELINE_ROW = "bundlesdf-1"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -47,16 +48,15 @@ def _parser() -> Parser:
     parser.add_argument("--model", metavar="RESULTS", type=Path, help="track with a shape that was learned before")
     parser.add_argument("--tracker", metavar="NAME", default=TRACKERS[0], help=f"one of: {', '.join(TRACKERS)}")
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="cpu (default) or cuda")
-    if find_spec(CONTACT):
-        import_module(CONTACT).add_arguments(parser)
+    import_module(CONTACT).add_arguments(parser)
     parser.set_defaults(work=_work)
     return parser
 
 
 def _work(args: argparse.Namespace) -> Outcome:
-    name = args.variant or (default_name() if args.tracker == TRACKERS[0] else "bundlesdf-1")
-    if name != CONTACT_ONLY or not find_spec(CONTACT):
-        find_variant(name)  # refuses by name, before anything is read
+    name = args.variant or (DEFAULT if args.tracker == TRACKERS[0] else BASELINE_ROW)
+    if name != CONTACT_ONLY:
+        rows_of(name, args.scope)  # refuses by name, before anything is read
         _refuse_what_is_not_there(args)
     sessions = [_session_path(s) for s in args.sessions] or [_sample_path()]
     if len(sessions) > 1 and args.truth is not None:
@@ -121,13 +121,20 @@ def _process(args: argparse.Namespace, path: Path, name: str, several: bool) -> 
 
 
 def _vision(args: argparse.Namespace, session: Session, name: str, out: Path) -> Outcome:
-    from processing.config import Config
     from processing.pipeline import process, start_run
 
     tosses = chosen_tosses(args.toss, session.tosses)
-    run = start_run(session, tosses, out, Config(), args.tracker, progress_for, args.device)
-    process(run, find_variant(name), args.scope)
+    run = start_run(session, tosses, out, config_of(args), args.tracker, progress_for, args.device)
+    for variant, scope in rows_of(name, args.scope):
+        process(run, variant, scope)
     return _evaluate(args, session, out)  # the door to truth is opened after every track and shape is written
+
+
+def config_of(args: argparse.Namespace) -> Config:
+    """The pipeline's settings that the command line asks for; everything else stays as it is by default."""
+    from processing.config import Config
+
+    return Config()
 
 
 def _evaluate(args: argparse.Namespace, session: Session, out: Path) -> Outcome:
@@ -155,8 +162,6 @@ def _evaluate(args: argparse.Namespace, session: Session, out: Path) -> Outcome:
 
 
 def _contact_only(args: argparse.Namespace, session: Session, out: Path) -> Outcome:
-    if not find_spec(CONTACT):
-        raise BadInput("variant contact-only needs contact learning: not there yet")
     outcome: Any = import_module(CONTACT).run(args, session, out, progress_for("contact-only"))
     return outcome if isinstance(outcome, Outcome) else Outcome({"results": str(out)}, f"results: {out}")
 

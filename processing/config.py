@@ -4,7 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from processing.contact.from_tracks import TracksConfig
 from processing.field.learn import LearnConfig
+from processing.given_masks import DEFAULT_MASKS, GivenMasks
+from processing.rig import RigSettings
+from processing.second_pass import CycleConfig
 from processing.segment.background import BackgroundSettings
 from processing.segment.static_scene import SceneSettings
 from processing.track.frame_to_model import FrameToModelSettings
@@ -17,8 +21,13 @@ class Config:
     """What each stage is run with; saved beside its result in stage.json."""
 
     scene: SceneSettings = field(default_factory=SceneSettings)
+    rig: RigSettings = field(default_factory=RigSettings)
     masks: BackgroundSettings = field(default_factory=BackgroundSettings)
+    given_masks: GivenMasks = DEFAULT_MASKS
+    """Which of the session's masks are used: see processing.given_masks."""
     track: TrackConfig = field(default_factory=TrackConfig)
     register: RegisterConfig = field(default_factory=RegisterConfig)
     shape: LearnConfig = field(default_factory=LearnConfig)
+    cycle: CycleConfig = field(default_factory=CycleConfig)
+    contact: TracksConfig = field(default_factory=TracksConfig)
     frame_to_model: FrameToModelSettings = field(default_factory=FrameToModelSettings)

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32
 from numpy import ndarray as Array
 
-from recordings.geometry import CameraModel, rotation_exp
+from recordings.geometry import CameraModel, rotation_exp, skew
 from recordings.tracks import ObjectShape
 
 Verdict = Literal["aligned", "too few points", "poor fit", "moved too far", "lost"]
@@ -38,6 +38,10 @@ class IcpConfig:
     most_translation_m: float = 0.02
     observable: float = 0.02
     """A direction whose eigenvalue is below this share of the best-constrained one's is not observable."""
+    least_noise_m: float = 0.0008
+    """Depth is never trusted more than this, however well the shape fits."""
+    points_per_measurement: float = 25.0
+    """Depth errors are alike over a patch of pixels: so many points weigh as one independent measurement."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,18 +82,27 @@ def align_frame(
     points_camera_m: Float[Array, "n 3"],
     camera_from_object: Float[Array, "4 4"],
     config: IcpConfig,
+    covariance: Float[Array, "6 6"] | None = None,
 ) -> Alignment:
-    """Move the pose so that the shape lies on the raw points of one frame (n, 3) in the camera frame."""
+    """Move the pose so that the shape lies on the raw points of one frame (n, 3) in the camera frame.
+
+    With the start's `covariance` (rotation vector, translation of the origin, camera axes; rad, m) the result is the
+    most probable pose given both: what depth says little about stays with the tracker.
+    """
     if not np.isfinite(camera_from_object).all():
         return Alignment(camera_from_object, "lost", 0.0, float("nan"), 6)
     if len(points_camera_m) < config.fewest_points:
         return Alignment(camera_from_object, "too few points", 0.0, float("nan"), 6)
     pose, held = camera_from_object.copy(), 6
+    known = _known(surface, camera_from_object, covariance)
+    gone = np.zeros(6)  # the correction so far, rotation scaled by the radius
     for step in range(config.iterations):
         reach_m = config.reach_m * max(1 / 3, 1 - step / max(config.iterations - 1, 1))
         in_object, gap, normal, facing = _matches(surface, points_camera_m, pose)
         use = facing & (np.abs(gap) < reach_m)
-        move, held = _solve(in_object - surface.centre_m, gap, normal, use, surface.radius_m, reach_m, config)
+        arm = in_object - surface.centre_m
+        move, held = _solve(arm, gap, normal, use, surface.radius_m, reach_m, config, known, gone)
+        gone += np.concatenate([move[:3] * surface.radius_m, move[3:]])
         pose = pose @ _about(surface.centre_m, move)
         if np.linalg.norm(move[:3]) < 1e-5 and np.linalg.norm(move[3:]) < 1e-6:
             break
@@ -108,17 +121,18 @@ def align_frames(
     camera: CameraModel,
     camera_from_object: Float[Array, "n 4 4"],
     config: IcpConfig,
+    covariance: Float[Array, "n 6 6"] | None = None,
 ) -> list[Alignment]:
     """`align_frame` on every frame of a toss; raw depth inside the raw mask is what the shape is laid on."""
     surface = ShapeSurface(shape)
     rays = camera.pixel_rays()
     out = []
-    for depth_m, mask, pose in zip(depths_m, masks, camera_from_object, strict=True):
+    for i, (depth_m, mask, pose) in enumerate(zip(depths_m, masks, camera_from_object, strict=True)):
         v, u = np.nonzero(mask & (depth_m > 0))
         every = max(1, len(v) // config.most_points)
         v, u = v[::every], u[::every]
         points = rays[v, u] * depth_m[v, u, None].astype(np.float64)
-        out.append(align_frame(surface, points, pose, config))
+        out.append(align_frame(surface, points, pose, config, None if covariance is None else covariance[i]))
     return out
 
 
@@ -150,8 +164,12 @@ def _solve(
     radius_m: float,
     reach_m: float,
     config: IcpConfig,
+    known: Float[Array, "6 6"],
+    gone: Float[Array, "6"],
 ) -> tuple[Float[Array, "6"], int]:
     """Correction (rotation vector, shift) of object coordinates about the centre, and how many directions were held.
+
+    `known`: information on the correction from elsewhere, whose part so far is `gone`.
 
     Rotation is scaled by the object's radius, so that eigenvalues of turning and shifting can be compared.
     """
@@ -159,13 +177,30 @@ def _solve(
         return np.zeros(6), 6
     weight = np.where(use, (1 - (gap / reach_m) ** 2) ** 2, 0.0)
     jacobian = np.concatenate([np.cross(arm, normal) / radius_m, normal], -1)
-    information = (weight[:, None] * jacobian).T @ jacobian
-    right = (weight * gap) @ jacobian
+    noise_m = max(1.4826 * float(np.median(np.abs(gap[use]))), config.least_noise_m)
+    share = 1 / (noise_m**2 * config.points_per_measurement)
+    depth = share * (weight[:, None] * jacobian).T @ jacobian
+    information = depth + known
+    right = share * (weight * gap) @ jacobian - known @ gone
     values, vectors = np.linalg.eigh(information)
-    seen = values > config.observable * values[-1]
+    by_depth = np.einsum("ik,ij,jk->k", vectors, depth, vectors)
+    seen = by_depth > config.observable * by_depth.max()
     scaled = vectors[:, seen] @ ((vectors[:, seen].T @ right) / values[seen])
     # the points move by -correction in object coordinates when the pose moves by +correction
     return np.concatenate([scaled[:3] / radius_m, scaled[3:]]), int((~seen).sum())
+
+
+def _known(
+    surface: ShapeSurface, camera_from_object: Float[Array, "4 4"], covariance: Float[Array, "6 6"] | None
+) -> Float[Array, "6 6"]:
+    """A track's covariance as information on a correction about the shape's centre in object axes."""
+    if covariance is None or not np.isfinite(covariance).all():
+        return np.zeros((6, 6))
+    turn = camera_from_object[:3, :3]
+    to = np.zeros((6, 6))
+    to[:3, :3] = surface.radius_m * turn.T
+    to[3:, :3], to[3:, 3:] = -turn.T @ skew(turn @ surface.centre_m), turn.T
+    return np.asarray(np.linalg.pinv(to @ covariance @ to.T, hermitian=True))
 
 
 def _about(centre_m: Float[Array, "3"], move: Float[Array, "6"]) -> Float[Array, "4 4"]:

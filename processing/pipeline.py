@@ -13,12 +13,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from processing.config import Config
+from processing.cycle import Pass, place_stage, run_cycle
 from processing.masks import object_masks, static_scene
 from processing.stage import Counts, Done, Store, locked
 from processing.track.frame_to_model import FrameToModel
 from processing.variants import TRACKERS, Variant
 from processing.vision import CAMERA, field_stage, register_stage, track_stage
 from recordings.errors import BadInput
+from recordings.geometry import CameraModel
 from recordings.progress import Progress
 from recordings.results import (
     Scope,
@@ -29,7 +31,7 @@ from recordings.results import (
     write_track,
     write_variant,
 )
-from recordings.session import Session
+from recordings.session import RgbdFrames, Session
 from recordings.session_writer import file_sha256
 
 MakeProgress = Callable[[str], Progress]
@@ -47,6 +49,15 @@ class Run:
     device: str
     progress: MakeProgress
     keys: Mapping[str, str]
+
+    @property
+    def camera(self) -> CameraModel:
+        """The camera that everything is tracked in."""
+        return self.session.calibration.camera(CAMERA)
+
+    def frames(self, toss: int) -> RgbdFrames:
+        """A toss's frames as vision sees them."""
+        return self.session.toss(toss).rgbd(CAMERA)
 
 
 def start_run(
@@ -69,6 +80,8 @@ def start_run(
     keys = {f"toss_{t:02d}": file_sha256(session.file(t)) for t in tosses}
     calibration = json.dumps(session.calibration.to_json(), sort_keys=True).encode()
     keys["calibration"] = hashlib.sha256(calibration).hexdigest()
+    physics = json.dumps(session.start.get("object"), sort_keys=True, default=str).encode()
+    keys["physics"] = hashlib.sha256(physics).hexdigest()
     return Run(session, tuple(tosses), Store(results), config, tracker, device, progress, keys)
 
 
@@ -77,46 +90,32 @@ def process(run: Run, variant: Variant, scope: Scope) -> VariantRecord:
     scene = static_scene(run)
     masks = {t: object_masks(run, t, scene) for t in run.tosses}
     once = {t: first_pass(run, t, masks[t]) for t in run.tosses}  # p_i
-    if variant.poses_from == "all_tosses":
-        tracks, shapes, notes = _all_together(run, once, masks)  # P, O
+    if variant.first == "one_toss":
+        last = _alone(run, once, masks, scope)  # p_i, O_i
     else:
-        tracks, shapes, notes = once, _alone(run, once, masks, scope), ["each toss has its own object frame"]
-    tosses = [TossRecord(t, tracks[t].name, shapes[t].name, masks[t].name) for t in run.tosses]
-    record = VariantRecord(
-        name=variant.name,
-        scope=scope,
-        label=variant.label,
-        session_name=run.session.name,
-        object_name=run.session.object_name,
-        calibration=run.session.calibration,
-        tosses=tuple(tosses),
-        shape=tosses[0].shape if scope == "all" else None,
-        shared_object_frame=variant.poses_from == "all_tosses",
-        session_path=os.path.relpath(run.session.path.resolve(), run.store.results.resolve()),
-        notes=(f"tracker: {run.tracker}", *notes),
-        extra={"tracker": run.tracker},
-    )
+        first = _all_together(run, once, masks)  # P, O
+        last = first if variant.refined is None else _refined_rows(run, variant, scope, once, first, masks)
+    record = _record(run, variant, scope, last, masks)
     with locked(run.store.results / ".variants.lock"):
         write_variant(run.store.results, record)
     return record
 
 
-def _alone(run: Run, once: Mapping[int, Done], masks: Mapping[int, Done], scope: Scope) -> dict[int, Done]:
-    """O_i: in scope all only the first toss's shape is looked at."""
+def _alone(run: Run, once: Mapping[int, Done], masks: Mapping[int, Done], scope: Scope) -> Pass:
+    """p_i, O_i: in scope all only the first toss's shape is looked at."""
+    notes = ("each toss has its own object frame",)
     if run.tracker == FrameToModel.name:
-        return dict(once)
+        return Pass(once, once, masks, shared_frame=False, notes=notes)
     wanted = run.tosses if scope == "one" else run.tosses[:1]
     shapes = {t: field_stage(run, f"toss {t}", {t: once[t]}, {t: masks[t]}) for t in wanted}
-    return {t: shapes.get(t, shapes[wanted[0]]) for t in run.tosses}
+    return Pass(once, {t: shapes.get(t, shapes[wanted[0]]) for t in run.tosses}, masks, shared_frame=False, notes=notes)
 
 
-def _all_together(
-    run: Run, once: Mapping[int, Done], masks: Mapping[int, Done]
-) -> tuple[dict[int, Done], dict[int, Done], list[str]]:
+def _all_together(run: Run, once: Mapping[int, Done], masks: Mapping[int, Done]) -> Pass:
     """P, O: all tosses in one object frame, and one shape."""
     if run.tracker == FrameToModel.name:
         raise BadInput(
-            f"--tracker {run.tracker} has no registration between tosses, so no bundlesdf-10; "
+            f"--tracker {run.tracker} has no registration between tosses, so bundlesdf-1 is its only row; "
             f"take --tracker {TRACKERS[0]}, or --variant bundlesdf-1"
         )
     together = register_stage(run, dict(once), dict(masks))
@@ -125,7 +124,43 @@ def _all_together(
     notes = [f"tosses {left_out} could not be brought into the object frame of the others: lost"] if left_out else []
     joined = [t for t in run.tosses if t not in left_out]
     shape = field_stage(run, "all tosses", dict.fromkeys(joined, together), {t: masks[t] for t in joined})
-    return tracks, dict.fromkeys(run.tosses, shape), notes
+    return Pass(tracks, dict.fromkeys(run.tosses, shape), masks, shared_frame=True, notes=tuple(notes))
+
+
+def _refined_rows(
+    run: Run, variant: Variant, scope: Scope, once: Mapping[int, Done], first: Pass, masks: Mapping[int, Done]
+) -> Pass:
+    """The cycle on all tosses from P and O, or in scope one on every toss from p_i and O moved into its frame."""
+    if scope == "all":
+        return run_cycle(run, variant, first, "all tosses")
+    ended = []
+    for toss in run.tosses:
+        moved = place_stage(run, toss, first.tracks[toss], once[toss], first.shapes[toss])
+        alone = Pass({toss: once[toss]}, {toss: moved}, {toss: masks[toss]}, shared_frame=False)
+        ended.append(run_cycle(run, variant, alone, f"toss {toss}"))
+    return Pass.joined(ended)
+
+
+def _record(run: Run, variant: Variant, scope: Scope, last: Pass, masks: Mapping[int, Done]) -> VariantRecord:
+    tosses = [
+        TossRecord(t, last.tracks[t].name, last.shapes[t].name, last.masks.get(t, masks[t]).name) for t in run.tosses
+    ]
+    contact = {str(t): done.name for t, done in last.contact.items()}
+    return VariantRecord(
+        name=variant.name,
+        scope=scope,
+        label=variant.label,
+        session_name=run.session.name,
+        object_name=run.session.object_name,
+        calibration=run.session.calibration,
+        tosses=tuple(tosses),
+        shape=tosses[0].shape if scope == "all" else None,
+        contact=next(iter(contact.values()), None) if scope == "all" else None,
+        shared_object_frame=last.shared_frame,
+        session_path=os.path.relpath(run.session.path.resolve(), run.store.results.resolve()),
+        notes=(f"tracker: {run.tracker}", *last.notes),
+        extra={"tracker": run.tracker, "contact_of_toss": contact, "passes": list(last.passes)},
+    )
 
 
 def first_pass(run: Run, toss: int, masks: Done) -> Done:

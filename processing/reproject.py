@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Bool, Float, Float32, UInt32
 from numpy import ndarray as Array
 
 from recordings.errors import BadInput
@@ -51,17 +51,30 @@ class RaycastRenderer:
         self._rays = camera.pixel_rays()
 
     def depth(self, camera_from_object: Float[Array, "4 4"]) -> Float32[Array, "h w"]:
-        out = np.zeros((self._camera.height, self._camera.width), dtype=np.float32)
+        return self.hits(camera_from_object)[0]
+
+    def hits(
+        self, camera_from_object: Float[Array, "4 4"]
+    ) -> tuple[Float32[Array, "h w"], UInt32[Array, "h w"], Float32[Array, "h w 3"]]:
+        """Depth, the face that each ray meets, and where on it (barycentric weights of its corners)."""
+        size = (self._camera.height, self._camera.width)
+        out, face = np.zeros(size, dtype=np.float32), np.zeros(size, dtype=np.uint32)
+        weight = np.zeros((*size, 3), dtype=np.float32)
         box = self._box(camera_from_object)
         if box is None:
-            return out
+            return out, face, weight
         object_from_camera = np.linalg.inv(camera_from_object)
         along = self._rays[box] @ object_from_camera[:3, :3].T
         origin = np.broadcast_to(object_from_camera[:3, 3], along.shape)
         rays = np.concatenate([origin, along], -1).astype(np.float32)
-        hit = self._scene.cast_rays(self._core.Tensor(rays))["t_hit"].numpy()
-        out[box] = np.where(np.isfinite(hit), hit, 0)  # rays have z = 1, so t is depth along the axis
-        return out
+        found = self._scene.cast_rays(self._core.Tensor(rays))
+        hit = found["t_hit"].numpy()
+        met = np.isfinite(hit)
+        out[box] = np.where(met, hit, 0)  # rays have z = 1, so t is depth along the axis
+        face[box] = np.where(met, found["primitive_ids"].numpy(), 0)
+        uv = found["primitive_uvs"].numpy()
+        weight[box] = np.concatenate([1 - uv.sum(-1, keepdims=True), uv], -1)
+        return out, face, weight
 
     def _box(self, camera_from_object: Float[Array, "4 4"]) -> tuple[slice, slice] | None:
         """The part of the image that the shape can touch; all of it when a vertex is near or behind the camera."""

@@ -82,9 +82,11 @@ def register_tosses(
     matcher: FeatureMatcher | None = None,
     *,
     model: ObjectShape | None = None,
+    together: bool = False,
 ) -> Registered:
     """Tracks of several tosses (or one) of one object in one object frame, jointly refined: that of the first toss, or
     that of a learned shape, into which every toss is then placed by its form and colours (`first` means the shape).
+    `together`: the tracks are in one object frame already, nothing is sought.
 
     Raises BadInput where there is no toss, or the tosses are of different cameras.
     """
@@ -98,8 +100,10 @@ def register_tosses(
     first_from_own = np.tile(np.eye(4), (max(len(tosses), root + 1), 1, 1))
     fit = np.full(len(first_from_own), np.nan)
     fit[root] = 0.0
+    if together:
+        fit[:] = 0.0
     features: dict[int, Features] = {}
-    waiting = [t for t in range(len(tosses)) if t != root]
+    waiting = [] if together else [t for t in range(len(tosses)) if t != root]
     rounds = 0
     while waiting and rounds < 2:  # a toss that does not fit now may fit when more of the object is known
         for t in list(waiting):

@@ -1,0 +1,222 @@
+"""The cycle (the paper's steps 3 to 6): contact learning on the tracks, and vision again on what its shape explains.
+
+Passes are compared without truth, by their residuals on the raw images: see judge.py.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray as Array
+from scipy.spatial.transform import Rotation
+
+from processing.dynamics import contact_stage
+from processing.icp import ShapeSurface
+from processing.judge import Explained, explain, pooled
+from processing.second_pass import align_stage, input_keys, second_field, second_tracks
+from processing.stage import Counts, Done
+from recordings.geometry import rotation_angle_rad
+from recordings.results import read_masks, read_shape, read_track, write_shape
+from recordings.session_writer import write_json
+from recordings.tracks import ObjectShape, ObjectTrack
+
+if TYPE_CHECKING:
+    from processing.pipeline import Run
+    from processing.variants import Variant
+
+
+@dataclass(frozen=True, eq=False)
+class Pass:
+    """Where a pass ended, per toss: the stages that hold its track, its masks, and the shape in the track's object
+    frame. `passes`: what each pass of the cycle changed and how well it explains the raw images."""
+
+    tracks: Mapping[int, Done]
+    shapes: Mapping[int, Done]
+    masks: Mapping[int, Done]
+    shared_frame: bool
+    contact: Mapping[int, Done] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+    passes: tuple[Mapping[str, Any], ...] = ()
+
+    @staticmethod
+    def joined(parts: Sequence[Pass]) -> Pass:
+        """Passes on single tosses as one."""
+        return Pass(
+            {t: d for p in parts for t, d in p.tracks.items()},
+            {t: d for p in parts for t, d in p.shapes.items()},
+            {t: d for p in parts for t, d in p.masks.items()},
+            shared_frame=False,
+            contact={t: d for p in parts for t, d in p.contact.items()},
+            notes=tuple(dict.fromkeys(n for p in parts for n in p.notes)),
+            passes=tuple(x for p in parts for x in p.passes),
+        )
+
+
+def run_cycle(run: Run, variant: Variant, start: Pass, name: str) -> Pass:
+    """A row of the table from its first pass on."""
+    if variant.refined == "converged":
+        return _until_converged(run, start, name)
+    refined = with_contact(run, start, name) if variant.contact else start
+    if variant.refined == "contact":
+        return refined
+    ended = second_pass(run, refined, start.masks, name, variant.icp)
+    told = _told(run, start, ended, start.masks, name)
+    return replace(ended, passes=(told,), notes=(*ended.notes, *_said(told)))
+
+
+def with_contact(run: Run, start: Pass, name: str) -> Pass:
+    """Contact learning on the tracks with the shape as prior; its shape replaces vision's where it is not worse."""
+    shape = next(iter(start.shapes.values()))
+    learned = contact_stage(run, name, start.tracks, shape)
+    kept_out = learned.counts.get("kept_out")
+    if kept_out:
+        return replace(start, notes=(*start.notes, f"{name}: contact learning was kept out: {kept_out}"))
+    before, after = (judge_stage(run, name, start.tracks, dict.fromkeys(start.tracks, s), start.masks).counts
+                     for s in (shape, learned))  # fmt: skip
+    contact = dict.fromkeys(start.tracks, learned)
+    if after["depth_m"] > before["depth_m"] * (1 + run.config.cycle.worse_share):
+        said = f"{1e3 * after['depth_m']:.3f} mm against {1e3 * before['depth_m']:.3f} mm"
+        note = f"{name}: the shape that contact learned fits the raw depth worse than vision's ({said}): kept out"
+        return replace(start, contact=contact, notes=(*start.notes, note))
+    return replace(start, shapes=dict.fromkeys(start.tracks, learned), contact=contact)
+
+
+def second_pass(run: Run, refined: Pass, masks: Mapping[int, Done], name: str, icp: bool) -> Pass:
+    """The shape drawn at its poses (laid onto raw depth first where `icp`), and vision once more on that."""
+    shape = next(iter(refined.shapes.values()))
+    drawn = align_stage(run, name, refined.tracks, shape, masks, icp)
+    tracks = second_tracks(run, name, drawn, shape, masks)
+    field_of = second_field(run, name, tracks, drawn, shape, masks)
+    return replace(refined, tracks=tracks, shapes=dict.fromkeys(tracks, field_of),
+                   masks=dict.fromkeys(tracks, drawn))  # fmt: skip
+
+
+def _until_converged(run: Run, start: Pass, name: str) -> Pass:
+    """Passes until poses and shape stay as they are, or get worse on the raw images: then the better ones are kept."""
+    config, best, passes = run.config.cycle, start, []
+    for k in range(config.most_passes):
+        after = second_pass(run, with_contact(run, best, name), start.masks, name, icp=True)
+        told = {"pass": k + 2, **_told(run, best, after, start.masks, name)}
+        passes.append(told)
+        if told["worse_share"] > config.worse_share:
+            note = f"pass {k + 2} explains the raw images worse by {100 * told['worse_share']:.1f} %: pass {k + 1} kept"
+            return replace(best, passes=tuple(passes), notes=(*best.notes, note))
+        best = after
+        if told["same"]:
+            return replace(best, passes=tuple(passes), notes=(*best.notes, f"converged after pass {k + 2}"))
+    return replace(
+        best, passes=tuple(passes), notes=(*best.notes, f"not converged after {config.most_passes} passes of the cycle")
+    )
+
+
+def _told(run: Run, before: Pass, after: Pass, masks: Mapping[int, Done], name: str) -> dict[str, Any]:
+    """What changed from one pass to the next, and which of them explains the raw images better."""
+    was = judge_stage(run, name, before.tracks, before.shapes, masks).counts
+    now = judge_stage(run, name, after.tracks, after.shapes, masks).counts
+    shares = [now[k] / was[k] - 1 for k in ("depth_m", "mask", "color") if was[k] and now[k] is not None]
+    if now["frames"] + now["lost"]:
+        shares.append((now["lost"] - was["lost"]) / (now["frames"] + now["lost"]))
+    turned, moved = pose_change(before.tracks, after.tracks)
+    grown = shape_change(before.shapes, after.shapes)
+    config = run.config.cycle
+    same = turned < config.same_rotation_deg and moved < config.same_translation_m and grown < config.same_shape_m
+    return {
+        "of": name, "before": was, "after": now, "worse_share": float(np.mean(shares)) if shares else 0.0,
+        "rotation_deg": turned, "translation_m": moved, "shape_m": grown, "same": bool(same),
+    }  # fmt: skip
+
+
+def _said(told: Mapping[str, Any]) -> tuple[str, ...]:
+    if told["same"]:
+        return (f"{told['of']}: the second pass only repeats the first one",)
+    if told["worse_share"] > 0:
+        return (f"{told['of']}: the second pass explains the raw images worse by {100 * told['worse_share']:.1f} %",)
+    return ()
+
+
+def pose_change(before: Mapping[int, Done], after: Mapping[int, Done]) -> tuple[float, float]:
+    """Median turn (deg) and shift of the object's origin (m) over frames that both have, each toss at its own frame."""
+    turns, shifts = [], []
+    for toss in before:
+        a, b = (read_track(x[toss].folder, toss).camera_from_object for x in (before, after))
+        both = np.isfinite(a[:, 0, 0]) & np.isfinite(b[:, 0, 0])
+        for p, q in zip(a[both], b[both]):
+            turns.append(np.degrees(rotation_angle_rad(p[:3, :3].T @ q[:3, :3])))
+            shifts.append(np.linalg.norm(p[:3, 3] - q[:3, 3]))
+    return (float(np.median(turns)), float(np.median(shifts))) if turns else (float("inf"), float("inf"))
+
+
+def shape_change(before: Mapping[int, Done], after: Mapping[int, Done]) -> float:
+    """Mean distance (m) of the new surface's vertices to the old surface."""
+
+    toss = next(iter(before))
+    old, new = read_shape(before[toss].folder), read_shape(after[toss].folder)
+    nearest, _ = ShapeSurface(old).nearest(new.vertices_m)
+    return float(np.linalg.norm(nearest - new.vertices_m, axis=1).mean())
+
+
+def place_stage(run: Run, toss: int, together: Done, alone: Done, shape: Done) -> Done:
+    """Stage `place`: O moved into p_i's object frame, by the motion that lays P's poses of toss i on p_i's."""
+    inputs = {"together": together.key, "alone": alone.key, "shape": shape.key, "toss": str(toss)}
+
+    def compute(folder: Path) -> Counts:
+        own, shared = read_track(alone.folder, toss), read_track(together.folder, toss)
+        own_from_shared, residual = placement(own, shared)
+        write_shape(folder, moved_shape(read_shape(shape.folder), own_from_shared, own.object_frame))
+        return {"toss": toss, **residual}
+
+    return run.store.run("place", 1, {}, inputs, compute)
+
+
+def placement(own: ObjectTrack, shared: ObjectTrack) -> tuple[Float[Array, "4 4"], dict[str, float]]:
+    """own_object_from_shared_object by the frames that both tracked, and how far they are from agreeing.
+
+    The chordal mean of all frames' motions, then once more without the frames further off than three times the median.
+    """
+    both = np.isfinite(own.camera_from_object[:, 0, 0]) & np.isfinite(shared.camera_from_object[:, 0, 0])
+    if not both.any():
+        return np.eye(4), {"frames": 0, "rotation_deg": float("nan"), "translation_m": float("nan")}
+    steps = np.linalg.inv(own.camera_from_object[both]) @ shared.camera_from_object[both]
+    use = np.ones(len(steps), dtype=bool)
+    mean = np.eye(4)
+    for _ in range(2):
+        mean[:3, :3] = Rotation.from_matrix(steps[use, :3, :3]).mean().as_matrix()
+        mean[:3, 3] = steps[use, :3, 3].mean(0)
+        turn = np.array([float(rotation_angle_rad(s[:3, :3] @ mean[:3, :3].T)) for s in steps])
+        shift = np.linalg.norm(steps[:, :3, 3] - mean[:3, 3], axis=1)
+        use = (turn <= 3 * np.median(turn) + 1e-9) & (shift <= 3 * np.median(shift) + 1e-9)
+    figures = {"rotation_deg": float(np.degrees(np.median(turn))), "translation_m": float(np.median(shift))}
+    return mean, {"frames": int(both.sum()), **figures}
+
+
+def moved_shape(shape: ObjectShape, target_from_source: Float[Array, "4 4"], frame: str) -> ObjectShape:
+    """The shape in another object frame."""
+    vertices = shape.vertices_m @ target_from_source[:3, :3].T + target_from_source[:3, 3]
+    return replace(shape, vertices_m=vertices, object_frame=frame)
+
+
+def judge_stage(run: Run, name: str, tracks: Mapping[int, Done], shapes: Mapping[int, Done],
+                masks: Mapping[int, Done]) -> Done:  # fmt: skip
+    """Stage `judge`: how well shape and poses explain the raw images, without truth."""
+    inputs = {**{f"shape_{t:02d}": s.key for t, s in shapes.items()}, **input_keys(tracks, masks)}
+
+    def compute(folder: Path) -> Counts:
+        parts: list[Explained] = []
+        progress = run.progress(f"{name}: residuals on the raw images")
+        for done, toss in enumerate(tracks):
+            progress.step(done, len(tracks), f"toss {toss}")
+            body, track = read_shape(shapes[toss].folder), read_track(tracks[toss].folder, toss)
+            seen = read_masks(masks[toss].folder, toss)
+            parts.append(explain(body, track, run.frames(toss), seen, run.camera, run.config.cycle.judge))
+        every = pooled(parts)
+        with open(folder / "residuals.npz", "wb") as out:
+            np.savez(out, rows=every.rows)
+        write_json(folder / "evidence.json", every.evidence().to_json())
+        return every.evidence().to_json()
+
+    return run.store.run("judge", 1, run.config.cycle.judge, inputs, compute)

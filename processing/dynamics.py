@@ -1,0 +1,74 @@
+"""The contact stage (the paper's step 3): friction, support geometry and a corrected mesh from the tracks."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from processing.stage import Counts, Done
+from processing.vision import CAMERA
+from recordings.errors import BadInput
+from recordings.results import read_shape, read_track, write_contact, write_shape
+from recordings.session_writer import write_json
+from recordings.tracks import ObjectShape
+
+if TYPE_CHECKING:
+    from processing.pipeline import Run
+
+
+def contact_stage(run: Run, name: str, tracks: Mapping[int, Done], shape: Done) -> Done:
+    """Stage `contact`: learned from these tosses with the shape as prior.
+
+    Where nothing can be learned (no plane known, no contact, lost tracks) the stage says why in `kept_out`, and its
+    shape is the prior: vision's result does not need contact.
+    """
+    inputs = {"shape": shape.key, **{f"track_{t:02d}": d.key for t, d in tracks.items()}}
+    inputs |= {"calibration": run.keys["calibration"], "object": run.keys["physics"]}
+
+    def compute(folder: Path) -> Counts:
+        prior = read_shape(shape.folder)
+        try:
+            return _learn(run, name, tracks, folder, prior)
+        except BadInput as why:
+            write_shape(folder, prior)
+            return {"kept_out": str(why)}
+
+    return run.store.run("contact", 1, run.config.contact, inputs, compute)
+
+
+def _learn(run: Run, name: str, tracks: Mapping[int, Done], folder: Path, prior: ObjectShape) -> Counts:
+    from processing.contact.export import write_assets
+    from processing.contact.from_tracks import learn_from_tracks
+    from processing.contact.inertia import physics_of_session
+    from processing.contact.stage import session_plane
+
+    world_from_camera = run.session.calibration.find("world", CAMERA)
+    if world_from_camera is None:
+        raise BadInput(NO_PLANE)
+    learned = learn_from_tracks(
+        {t: read_track(d.folder, t) for t, d in tracks.items()},
+        prior,
+        world_from_camera,
+        session_plane(run.session),
+        physics_of_session(run.session.start),
+        run.config.contact,
+        run.progress(f"{name}: contact"),
+    )
+    write_shape(folder, learned.shape)
+    write_contact(folder, learned.model)
+    write_assets(folder, learned.model, learned.shape)
+    write_json(folder / "result.json", learned.document)
+    return {
+        "friction": learned.model.friction,
+        "geometry": learned.choice.name,
+        "geometry_because": learned.choice.reason,
+        "left_out": {str(t): why for t, why in learned.left_out.items()},
+        "most_moved_m": float(learned.moved_m.max()),
+    }
+
+
+NO_PLANE = (
+    "the calibration does not say where the table is (no `world`), and contact needs the plane; run `toss-calibrate "
+    "table SESSION`, or let it be estimated from depth: --table-from-depth"
+)

@@ -1,0 +1,134 @@
+"""How well a shape at its poses explains the raw images: the evidence by which passes are compared without truth.
+
+A reprojected depth agrees with the poses it was drawn from by making, so only what the camera measured counts: raw
+depth inside the first masks, the outline of those masks, and the picture's own colours.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+from numpy import ndarray as Array
+
+from processing.reproject import RaycastRenderer
+from recordings.geometry import CameraModel
+from recordings.records import RgbdFrame
+from recordings.tracks import ObjectShape, ObjectTrack
+
+FAR_M = 0.02
+"""Residuals beyond this are one and the same: not explained."""
+
+
+@dataclass(frozen=True)
+class JudgeConfig:
+    every: int = 4
+    """Every which frame of a toss is looked at."""
+    border_px: int = 2
+    """Pixels this near the mask's outline mix object and background: no depth or colour residuals from there."""
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Means over the frames looked at (`frames`): absolute depth residual (m), 1 - IoU of the outline, colour residual
+    (grey levels of 255, after each frame's own gain; NaN without colours). `lost`: frames without a pose."""
+
+    depth_m: float
+    mask: float
+    color: float
+    frames: int
+    lost: int
+
+    def to_json(self) -> dict[str, float | int | None]:
+        return {k: (v if np.isfinite(v) else None) for k, v in asdict(self).items()}
+
+
+@dataclass(frozen=True, eq=False)
+class Explained:
+    """Residuals of single frames by position: rows (toss, position, depth_m, mask, color)."""
+
+    rows: Float[Array, "n 5"]
+    lost: int
+
+    def evidence(self) -> Evidence:
+        if len(self.rows) == 0:
+            return Evidence(float("nan"), float("nan"), float("nan"), 0, self.lost)
+        with np.errstate(all="ignore"):
+            color = self.rows[:, 4][np.isfinite(self.rows[:, 4])]
+        depth_m, mask = self.rows[:, 2].mean(), self.rows[:, 3].mean()
+        return Evidence(
+            float(depth_m), float(mask), float(color.mean()) if len(color) else float("nan"), len(self.rows), self.lost
+        )
+
+
+def explain(
+    shape: ObjectShape,
+    track: ObjectTrack,
+    frames: Sequence[RgbdFrame],
+    masks: Sequence[Bool[Array, "h w"]],
+    camera: CameraModel,
+    config: JudgeConfig,
+) -> Explained:
+    """Residuals of a shape at a track's poses in one toss. A frame without a pose counts as lost, not as good."""
+    import cv2
+
+    drawer = ShapeDrawer(shape, camera)
+    rows, lost = [], 0
+    kernel = np.ones((2 * config.border_px + 1,) * 2, np.uint8)
+    for i in range(0, len(track.status), config.every):
+        pose = track.camera_from_object[i]
+        mask = np.asarray(masks[i], dtype=bool)
+        if not np.isfinite(pose).all() or not mask.any():
+            lost += int(mask.any())
+            continue
+        frame = frames[i]
+        depth_m, rgb = drawer.draw(pose)
+        seen = depth_m > 0
+        union = float((seen | mask).sum())
+        inside = cv2.erode(mask.astype(np.uint8), kernel).astype(bool)
+        measured = inside & (frame.depth_m > 0)
+        gap = np.where(seen, np.abs(frame.depth_m - depth_m), FAR_M)[measured]
+        depth = float(np.minimum(gap, FAR_M).mean()) if len(gap) else float("nan")
+        if not np.isfinite(depth):
+            continue
+        both = inside & seen
+        rows.append((track.toss, i, depth, 1 - float((seen & mask).sum()) / union, _color(frame, rgb, both)))
+    return Explained(np.array(rows, dtype=np.float64).reshape(-1, 5), lost)
+
+
+def pooled(parts: Sequence[Explained]) -> Explained:
+    """Several tosses as one."""
+    return Explained(np.concatenate([p.rows for p in parts]), sum(p.lost for p in parts))
+
+
+def _color(frame: RgbdFrame, rgb: UInt8[Array, "h w 3"] | None, both: Bool[Array, "h w"]) -> float:
+    """Median absolute difference of grey, after the gain and offset that fit the frame best."""
+    if rgb is None or both.sum() < 50:
+        return float("nan")
+    drawn = rgb[both].astype(np.float64).mean(-1)
+    taken = frame.color_rgb[both].astype(np.float64).mean(-1)
+    spread = drawn.std()
+    gain = float(np.clip(((drawn - drawn.mean()) * (taken - taken.mean())).mean() / max(spread**2, 1.0), 0.3, 3.0))
+    return float(np.median(np.abs(taken - taken.mean() - gain * (drawn - drawn.mean()))))
+
+
+class ShapeDrawer:
+    """Depth and colours of a shape at a pose, through the lens as it is."""
+
+    def __init__(self, shape: ObjectShape, camera: CameraModel) -> None:
+        self._renderer = RaycastRenderer(shape, camera)
+        self._rgb = None if shape.vertex_rgb is None else shape.vertex_rgb.astype(np.float32)
+        self._faces = shape.faces
+
+    def draw(self, camera_from_object: Float[Array, "4 4"]) -> tuple[Array, UInt8[Array, "h w 3"] | None]:
+        """Depth (m, 0 outside) and colours, None for a shape without any."""
+        depth_m, face, weight = self._renderer.hits(camera_from_object)
+        if self._rgb is None:
+            return depth_m, None
+        rgb = np.zeros((*depth_m.shape, 3), dtype=np.uint8)
+        seen = depth_m > 0
+        corners = self._rgb[self._faces[face[seen]]]
+        rgb[seen] = np.clip((corners * weight[seen][..., None]).sum(1), 0, 255).astype(np.uint8)
+        return depth_m, rgb
