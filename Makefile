@@ -4,7 +4,7 @@ BIN := .venv/bin
 STAMP := .venv/.installed
 OUT := out/demo
 SAMPLE := recordings/samples/box_toss
-EXTRAS := dev,sim,rig-realsense,rig-franka,rig-ur
+EXTRAS := dev,sim,learned,rig-realsense,rig-franka,rig-ur
 
 .PHONY: setup demo test test-all check bench
 
