@@ -149,8 +149,33 @@ def solve_cones(
 ) -> ConeSolution:
     """Solve n problems of k contacts at once. `start` is the `primal` of an earlier, similar solve.
 
-    A row that is not solved after MOST_ITERATIONS, or whose numbers overflow, is marked in `failed`.
+    A row that is not solved after MOST_ITERATIONS, or whose numbers overflow, is marked in `failed`. On a CPU the rows
+    run through compiled code (solver_cpu), on CUDA as one batch (solve_batch).
     """
+    if A.device.type != "cpu":
+        return solve_batch(A, q, epsilon, start, tolerance)
+    from processing.contact.solver_cpu import solve_rows
+
+    n, k = A.shape[:2]
+    primal = A.new_zeros((n, 6)) if start is None else start.clone()
+    rows, offset = A.reshape(n, 3 * k, 6).contiguous().numpy(), q.reshape(n, 3 * k).contiguous().numpy()
+    found, unsolved, iterations = solve_rows(
+        rows, offset, epsilon, primal.numpy(), tolerance, MOST_ITERATIONS, FLAT_ENOUGH, SEARCH_STEPS
+    )
+    impulse, failed = torch.from_numpy(found), torch.from_numpy(unsolved)
+    failed |= ~torch.isfinite(impulse).all(-1)
+    return ConeSolution(impulse.view(n, k, 3), primal, failed, int(iterations))
+
+
+@torch.no_grad()
+def solve_batch(
+    A: Float[Tensor, "n k 3 6"],
+    q: Float[Tensor, "n k 3"],
+    epsilon: float,
+    start: Float[Tensor, "n 6"] | None = None,
+    tolerance: float = TOLERANCE,
+) -> ConeSolution:
+    """The same on any device, all rows at once; rows leave the batch as they converge."""
     n, k = A.shape[:2]
     begin = A.new_zeros((n, 6)) if start is None else start.clone()
     batch = _Batch(A.reshape(n, 3 * k, 6), q.reshape(n, 3 * k), begin, epsilon)

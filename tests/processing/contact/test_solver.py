@@ -4,7 +4,7 @@ import pytest
 import scipy.sparse
 import torch
 
-from processing.contact.solver import in_cone, project, project_jacobian, solve_cones
+from processing.contact.solver import in_cone, project, project_jacobian, solve_batch, solve_cones
 
 
 def problems(count, contacts, seed):
@@ -34,10 +34,11 @@ def value(A, q, epsilon, impulse):
     return 0.5 * momentum @ momentum + 0.5 * epsilon * np.sum(impulse**2) + np.sum(q * impulse)
 
 
+@pytest.mark.parametrize("solve", [solve_cones, solve_batch])
 @pytest.mark.parametrize("contacts", [1, 4, 10])
-def test_agrees_with_an_interior_point_solver_to_1e_6(contacts):
+def test_agrees_with_an_interior_point_solver_to_1e_6(contacts, solve):
     A, q = problems(40, contacts, seed=contacts)
-    solved = solve_cones(A, q, 1e-3)
+    solved = solve(A, q, 1e-3)
     assert not solved.failed.any()
     for i in range(len(A)):
         wanted, impulse = by_clarabel(A[i].numpy(), q[i].numpy(), 1e-3)
@@ -45,6 +46,16 @@ def test_agrees_with_an_interior_point_solver_to_1e_6(contacts):
             wanted, rel=1e-7, abs=1e-6
         )
         np.testing.assert_allclose(solved.impulse[i], impulse, atol=2e-4 * max(1.0, np.abs(impulse).max()))
+
+
+@pytest.mark.parametrize("contacts", [1, 4, 10])
+def test_compiled_rows_and_the_batch_are_one_algorithm(contacts):
+    A, q = problems(300, contacts, seed=5)
+    start = torch.as_tensor(np.random.default_rng(1).standard_normal((300, 6)))
+    rows, batch = (solve(A, q, 1e-3, start) for solve in (solve_cones, solve_batch))
+    torch.testing.assert_close(rows.impulse, batch.impulse, rtol=1e-7, atol=1e-8)
+    torch.testing.assert_close(rows.primal, batch.primal, rtol=1e-7, atol=1e-8)
+    assert rows.iterations == batch.iterations
 
 
 def test_impulses_lie_in_their_cones():
