@@ -178,21 +178,31 @@ def _describe(source: Path, warnings: Warnings) -> tuple[RigCalibration, dict[st
         )
         if others:
             warnings.add(f"streams {', '.join(others)} are left out: a session keeps colour and depth")
-        cameras = {"d455": _camera(color, "d455", warnings), "d455_depth": _camera(depth, "d455_depth", warnings)}
+        cameras = {
+            "d455": camera_model(color, "d455", warnings),
+            "d455_depth": camera_model(depth, "d455_depth", warnings),
+        }
         units = [s.as_depth_sensor().get_depth_scale() for s in device.query_sensors() if s.is_depth_sensor()]
         about = {"depth_unit_m": float(f"{units[0]:.7g}"), "depth_aligned_to_color": False, "fps": color.fps()}
         for name in ("name", "serial_number", "firmware_version", "product_line"):
             key = getattr(rs.camera_info, name)
             if device.supports(key):
                 about[name] = device.get_info(key)
-        place = depth.get_extrinsics_to(color)
-        color_from_depth = np.eye(4)
-        color_from_depth[:3, :3] = np.array(place.rotation).reshape(3, 3).T  # librealsense stores columns
-        color_from_depth[:3, 3] = place.translation
-    return RigCalibration(cameras, (Transform.from_matrix("d455", "d455_depth", color_from_depth),)), about
+        place = color_from_depth(depth, color, "d455", "d455_depth")
+    return RigCalibration(cameras, (place,)), about
 
 
-def _camera(profile: Any, frame: str, warnings: Warnings) -> CameraModel:
+def color_from_depth(depth: Any, color: Any, color_frame: str, depth_frame: str) -> Transform:
+    """The factory's extrinsics between two stream profiles."""
+    place = depth.get_extrinsics_to(color)
+    matrix = np.eye(4)
+    matrix[:3, :3] = np.array(place.rotation).reshape(3, 3).T  # librealsense stores columns
+    matrix[:3, 3] = place.translation
+    return Transform.from_matrix(color_frame, depth_frame, matrix)
+
+
+def camera_model(profile: Any, frame: str, warnings: Warnings) -> CameraModel:
+    """The factory's intrinsics of a stream profile; a lens model that this project lacks is fitted, and said so."""
     rs = _sdk()
     lens = profile.as_video_stream_profile().get_intrinsics()
     K = np.array([[lens.fx, 0, lens.ppx], [0, lens.fy, lens.ppy], [0, 0, 1]])
