@@ -39,6 +39,11 @@ class Recording:
     frames: Mapping[str, Mapping[int, tuple[Sighting, ...]]]
     odometry: Mapping[str, tuple[Int64[Array, " n"], Float[Array, "n 4 4"]]]
 
+    def odometry_at(self, topic: str, stamp_ns: int) -> Float[Array, "4 4"]:
+        """The pose of exactly this stamp."""
+        stamps, poses = self.odometry[topic]
+        return poses[int(np.searchsorted(stamps, stamp_ns))]
+
 
 def read_recording(folder: Path) -> Recording:
     """detections.npz where it is, else tag_detections.bag or .bag.bz2. Raises BadInput."""

@@ -21,6 +21,7 @@ from scipy import sparse
 from scipy.sparse.linalg import splu
 
 from groundtruth import se3
+from groundtruth.blocks import BlockPattern
 from groundtruth.factors import (
     CORNERS,
     Between,
@@ -28,6 +29,7 @@ from groundtruth.factors import (
     Distance,
     Prior,
     Projection,
+    Terms,
     between_terms,
     coordinate_terms,
     distance_terms,
@@ -205,6 +207,7 @@ class _System:
         self._corners = np.stack([q.size_m * CORNERS for q in p]) if p else np.zeros((0, 4, 3))
         self._seen = np.stack([q.corners_px for q in p]) if p else np.zeros((0, 4, 2))
         self._sigma = np.array([q.sigma_px for q in p])
+        self._pattern: BlockPattern | None = None
 
     def cost(self, poses: Float[Array, "n 4 4"]) -> float:
         total = 0.0
@@ -220,17 +223,18 @@ class _System:
 
     def normal_equations(self, poses: Float[Array, "n 4 4"]) -> tuple[sparse.csc_matrix, Float[Array, " d"]]:
         """J' W J and -J' W r over all factors."""
-        blocks = _Blocks(len(poses))
+        terms: list[Terms] = []
         if len(self._chain):
             residual, jacobians = self._linearised(poses)
             weight = self._robust(np.linalg.norm(residual, axis=-1) / self._sigma[:, None])[1]
             root = np.sqrt(weight) / self._sigma[:, None]
             residual = (residual * root[..., None]).reshape(len(residual), 8)
             scaled = [(J * root[..., None, None]).reshape(len(residual), 8, 6) for J in jacobians]
-            blocks.add(self._chain, scaled, residual)
-        for residuals, jacobians_of, indices in self._others(poses):
-            blocks.add(indices, jacobians_of, residuals)
-        return blocks.build()
+            terms.append((residual, scaled, self._chain))
+        terms += self._others(poses)
+        if self._pattern is None:
+            self._pattern = BlockPattern(len(poses), [index for _, _, index in terms])
+        return self._pattern.sum(terms)
 
     def _pixels(self, poses: Float[Array, "n 4 4"]) -> tuple[Array, Array, Array, Array]:
         """Residuals (m, 4, 2), points in the body, rig and camera frames (m, 4, 3)."""
@@ -289,31 +293,3 @@ class _System:
         if self._graph.distances:
             out.append(distance_terms(self._graph.distances, poses))
         return out
-
-
-class _Blocks:
-    """Sums of 6x6 blocks of the normal equations."""
-
-    def __init__(self, poses: int) -> None:
-        self._size = 6 * poses
-        self._rows: list[Array] = []
-        self._columns: list[Array] = []
-        self._values: list[Array] = []
-        self._right = np.zeros((poses, 6))
-
-    def add(self, index: Int[Array, "m k"], jacobians: list[Array], residual: Float[Array, "m d"]) -> None:
-        within = np.arange(6)
-        for i, A in enumerate(jacobians):
-            transposed = np.swapaxes(A, -1, -2)
-            np.add.at(self._right, index[:, i], -(transposed @ residual[..., None])[..., 0])
-            for j, B in enumerate(jacobians):
-                block = transposed @ B
-                rows = 6 * index[:, i, None, None] + within[:, None]
-                columns = 6 * index[:, j, None, None] + within[None, :]
-                self._rows.append(np.broadcast_to(rows, block.shape).ravel())
-                self._columns.append(np.broadcast_to(columns, block.shape).ravel())
-                self._values.append(block.ravel())
-
-    def build(self) -> tuple[sparse.csc_matrix, Float[Array, " d"]]:
-        values, rows, columns = (np.concatenate(x) for x in (self._values, self._rows, self._columns))
-        return sparse.csc_matrix((values, (rows, columns)), shape=(self._size, self._size)), self._right.ravel()

@@ -6,15 +6,17 @@ Every pose has a key: ("camera", name), ("tag", id), ("body", name, stamp) with 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Int64
+from jaxtyping import Float
 from numpy import ndarray as Array
 
-from groundtruth.detections import Recording
+from groundtruth.detections import Recording, Sighting
 from groundtruth.factors import CORNERS
+from groundtruth.synchronise import StampSet, approximate_sets, exact_sets
 from groundtruth.tagslam_config import BodyEntry, CameraEntry, TagEntry, TagSlamConfig
 from recordings.errors import BadInput
 from recordings.geometry import CameraModel
@@ -60,71 +62,138 @@ class Observation:
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """`stamps`: where TagSLAM answers: all topics have a message, and a tag is seen or odometry is there."""
+    """`stamps`: where TagSLAM answers: all topics have a message, and a tag is seen or odometry is there.
+    `odometry[body][stamp]`: the odometry's pose. `incomplete_stamps`: stamps at which some topic had no message."""
 
     config: TagSlamConfig
     stamps: tuple[int, ...]
     observations: tuple[Observation, ...]
     tags: dict[int, TagEntry]
     owner: dict[int, BodyEntry]
+    odometry: Mapping[str, Mapping[int, Float[Array, "4 4"]]]
     ignored: int
     incomplete_stamps: int
 
 
 def make_problem(config: TagSlamConfig, recording: Recording, most_frames: int | None = None) -> Problem:
-    """Match topics to cameras, apply remaps and squashes, solve each tag's two planar poses.
+    """Match topics to cameras, apply squashes and remaps, solve each tag's two planar poses.
 
     `most_frames`: only so many stamps. Raises BadInput where a camera's topic is not in the recording.
     """
     for camera in config.cameras:
+        config.body(camera.rig)
         if camera.tag_topic not in recording.frames:
             raise BadInput(
                 f"no detections on {camera.tag_topic} of {camera.name}; the recording has {sorted(recording.frames)}"
             )
-    stamps, incomplete = _complete_stamps(config, recording)
-    tags, owner = _tags(config)
-    observations: list[Observation] = []
-    answered, ignored = [], 0
-    has_odometry = bool(moving_with_odometry(config, recording)) or any(b.fake_odom_noise for b in config.bodies)
-    for stamp in stamps[:most_frames]:
-        before = len(observations)
-        for number, camera in enumerate(config.cameras):
-            seen_here: set[int] = set()
-            for sighting in recording.frames[camera.tag_topic][stamp]:
-                tag_id = _remapped(config, sighting.tag_id, camera, stamp)
-                body = owner.get(tag_id) or _adopt(config, tag_id, tags, owner)
-                squashed = tag_id in config.squashed.get(stamp, frozenset())
-                if (
-                    body is None
-                    or squashed
-                    or tag_id in seen_here
-                    or sighting.hamming > min(body.max_hamming, config.max_hamming)
-                ):
-                    ignored += 1
-                    continue
-                seen_here.add(tag_id)
-                rig = config.body(camera.rig)
-                observations.append(_observe(stamp, number, camera, rig, body, tags[tag_id], sighting.corners_px))
-        if len(observations) > before or has_odometry:
+    sets, messages = _synchronised(config, recording)
+    collector = _Collector(config, recording)
+    odometry: dict[str, dict[int, Float[Array, "4 4"]]] = {
+        b.name: {} for b in config.bodies if b.odom_topic in recording.odometry
+    }
+    always = bool(odometry) or any(b.fake_odom_noise for b in config.bodies)
+    answered = []
+    for stamps in sets[:most_frames]:
+        stamp = stamps[config.cameras[0].tag_topic]
+        for body in config.bodies:
+            if body.name in odometry and body.odom_topic is not None:
+                odometry[body.name][stamp] = recording.odometry_at(body.odom_topic, stamps[body.odom_topic])
+        if collector.collect(stamp, stamps) or always:
             answered.append(stamp)
-    return Problem(config, tuple(answered), tuple(observations), tags, owner, ignored, incomplete)
+    return Problem(
+        config,
+        tuple(answered),
+        collector.observed(),
+        collector.tags,
+        collector.owner,
+        odometry,
+        collector.ignored,
+        messages - len(sets),
+    )
 
 
-Odometry = tuple[Int64[Array, " n"], Float[Array, "n 4 4"]]
+def _synchronised(config: TagSlamConfig, recording: Recording) -> tuple[list[StampSet], int]:
+    """Sets of stamps, one of each camera's topic and each odometry's, and how many different stamps there were."""
+    stamps: dict[str, list[int]] = {c.tag_topic: sorted(recording.frames[c.tag_topic]) for c in config.cameras}
+    for body in config.bodies:
+        if body.odom_topic is not None and body.odom_topic in recording.odometry:
+            stamps[body.odom_topic] = [int(s) for s in recording.odometry[body.odom_topic][0]]
+    if config.approximate_sync:
+        return approximate_sets(stamps), max(len(s) for s in stamps.values())
+    return exact_sets(stamps), len(set().union(*stamps.values()))
 
 
-def moving_with_odometry(config: TagSlamConfig, recording: Recording) -> list[tuple[BodyEntry, Odometry]]:
-    """Bodies whose odometry is in the recording, with its stamps and poses."""
-    bodies = [(b, b.odom_topic) for b in config.bodies if b.odom_topic is not None]
-    return [(b, recording.odometry[topic]) for b, topic in bodies if topic in recording.odometry]
+class _Collector:
+    """Turns sightings into observations; tags that the configuration does not place go to the default body."""
+
+    def __init__(self, config: TagSlamConfig, recording: Recording) -> None:
+        self.config = config
+        self.recording = recording
+        self.observations: list[Observation] = []
+        self.ignored = 0
+        self.tags, self.owner = _tags(config)
+
+    def collect(self, stamp_ns: int, stamps: StampSet) -> bool:
+        """Add what all cameras saw; whether there was any tag."""
+        before = len(self.observations)
+        for number, camera in enumerate(self.config.cameras):
+            seen_here: set[int] = set()
+            for sighting in self.recording.frames[camera.tag_topic][stamps[camera.tag_topic]]:
+                observation = self._observe(stamp_ns, number, camera, sighting, seen_here)
+                if observation is None:
+                    self.ignored += 1
+                else:
+                    seen_here.add(observation.tag.tag_id)
+                    self.observations.append(observation)
+        return len(self.observations) > before
+
+    def _observe(
+        self, stamp_ns: int, number: int, camera: CameraEntry, sighting: Sighting, seen: set[int]
+    ) -> Observation | None:
+        config = self.config
+        if sighting.hamming > config.max_hamming or _squashed(config, sighting.tag_id, camera, stamp_ns):
+            return None
+        tag_id = _remapped(config, sighting.tag_id, camera, stamp_ns)
+        body = self.owner.get(tag_id) or _adopt(config, tag_id, self.tags, self.owner)
+        area = _area_px2(sighting.corners_px)
+        if body is None or tag_id in seen or 2 * area < config.minimum_tag_area_px2:
+            return None
+        tag, rig = self.tags[tag_id], config.body(camera.rig)
+        return Observation(stamp_ns, number, rig, body, tag, sighting.corners_px, *NOT_YET, area)
+
+    def observed(self) -> tuple[Observation, ...]:
+        """All observations with their planar solutions. What is seen too flat has none to start from; its corners still
+        count."""
+        flat = np.radians(self.config.minimum_viewing_deg)
+        out = list(self.observations)
+        for number, camera in enumerate(self.config.cameras):
+            mine = [i for i, o in enumerate(out) if o.camera == number]
+            sizes = np.array([out[i].tag.size_m for i in mine])
+            corners = np.array([out[i].corners_px for i in mine]).reshape(-1, 4, 2)
+            for i, (poses, errors) in zip(mine, planar_poses(camera.model, sizes, corners), strict=True):
+                keep = len(poses) if len(poses) and _view_angle_rad(poses[0]) >= flat else 0
+                out[i] = replace(out[i], candidates=poses[:keep], errors_px=errors[:keep])
+        return tuple(out)
 
 
-def _complete_stamps(config: TagSlamConfig, recording: Recording) -> tuple[list[int], int]:
-    """Stamps at which every camera and every odometry has a message, and how many others there were."""
-    sets = [set(recording.frames[c.tag_topic]) for c in config.cameras]
-    sets += [{int(s) for s in odometry[0]} for _, odometry in moving_with_odometry(config, recording)]
-    both = set.intersection(*sets)
-    return sorted(both), len(set.union(*sets)) - len(both)
+NOT_YET = (np.zeros((0, 4, 4)), np.zeros(0))
+
+
+def _squashed(config: TagSlamConfig, tag_id: int, camera: CameraEntry, stamp_ns: int) -> bool:
+    return any(
+        tag_id in s.tags and s.stamp_ns in (None, stamp_ns) and s.camera in (None, camera.name) for s in config.squashes
+    )
+
+
+def _view_angle_rad(camera_from_tag: Float[Array, "4 4"]) -> float:
+    """Between the tag's plane and the ray to its centre: pi/2 is seen from the front."""
+    ray = camera_from_tag[:3, 3] / max(float(np.linalg.norm(camera_from_tag[:3, 3])), 1e-9)
+    return float(np.arcsin(np.clip(abs(ray @ camera_from_tag[:3, 2]), 0.0, 1.0)))
+
+
+def _area_px2(corners_px: Float[Array, "4 2"]) -> float:
+    (ax, ay), (bx, by) = corners_px[2] - corners_px[0], corners_px[3] - corners_px[1]
+    return 0.5 * abs(float(ax * by - ay * bx))
 
 
 def _tags(config: TagSlamConfig) -> tuple[dict[int, TagEntry], dict[int, BodyEntry]]:
@@ -155,40 +224,37 @@ def _remapped(config: TagSlamConfig, tag_id: int, camera: CameraEntry, stamp_ns:
     return tag_id
 
 
-def _observe(
-    stamp_ns: int,
-    number: int,
-    camera: CameraEntry,
-    rig: BodyEntry,
-    body: BodyEntry,
-    tag: TagEntry,
-    corners_px: Float[Array, "4 2"],
-) -> Observation:
-    poses, errors = planar_poses(camera.model, tag.size_m, corners_px)
-    area = 0.5 * abs(float(np.cross(corners_px[2] - corners_px[0], corners_px[3] - corners_px[1])))
-    return Observation(stamp_ns, number, rig, body, tag, corners_px, poses, errors, area)
-
-
 def planar_poses(
-    camera: CameraModel, size_m: float, corners_px: Float[Array, "4 2"]
-) -> tuple[Float[Array, "k 4 4"], Float[Array, " k"]]:
-    """camera_from_tag of a single tag: the two solutions of the planar problem (Collins and Bartoli 2014), by error."""
-    ideal = camera.rays(corners_px)[:, :2]
+    camera: CameraModel, sizes_m: Float[Array, " n"], corners_px: Float[Array, "n 4 2"]
+) -> list[tuple[Float[Array, "k 4 4"], Float[Array, " k"]]]:
+    """camera_from_tag of single tags: the two solutions of the planar problem (Collins and Bartoli 2014) and their mean
+    corner errors in pixels, the better one first."""
+    ideal = camera.rays(corners_px)[..., :2]
+    found = [_two_poses(size, xy) for size, xy in zip(sizes_m, ideal, strict=True)]
+    owner = np.repeat(np.arange(len(found)), [len(f) for f in found])
+    poses = np.array([pose for f in found for pose in f]).reshape(-1, 4, 4)
+    points = sizes_m[owner, None, None] * CORNERS @ np.swapaxes(poses[:, :3, :3], -1, -2) + poses[:, None, :3, 3]
+    errors = np.linalg.norm(camera.project(points) - corners_px[owner], axis=-1).mean(axis=-1)
+    out = []
+    for i in range(len(found)):
+        mine = np.arange(*np.searchsorted(owner, [i, i + 1]))
+        mine = mine[np.argsort(errors[mine])]
+        out.append((poses[mine], errors[mine]))
+    return out
+
+
+def _two_poses(size_m: float, ideal: Float[Array, "4 2"]) -> list[Float[Array, "4 4"]]:
     if not np.isfinite(ideal).all():
-        return np.zeros((0, 4, 4)), np.zeros(0)
+        return []
     # OpenCV wants the corners from (-,+) clockwise
     order = [3, 2, 1, 0]
     found = cv2.solvePnPGeneric(
         size_m * CORNERS[order], np.ascontiguousarray(ideal[order]), np.eye(3), None, flags=cv2.SOLVEPNP_IPPE_SQUARE
     )
-    poses, errors = [], []
+    poses = []
     for turn, shift in zip(found[1], found[2], strict=True):
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = cv2.Rodrigues(turn)[0], shift[:, 0]
-        points = size_m * CORNERS @ pose[:3, :3].T + pose[:3, 3]
-        if not np.isfinite(pose).all() or (points[:, 2] < 1e-3).any():
-            continue
-        poses.append(pose)
-        errors.append(float(np.linalg.norm(camera.project(points) - corners_px, axis=1).mean()))
-    order_of_error = np.argsort(errors)
-    return np.array(poses).reshape(-1, 4, 4)[order_of_error], np.array(errors)[order_of_error]
+        if np.isfinite(pose).all() and ((size_m * CORNERS @ pose[:3, :3].T + pose[:3, 3])[:, 2] > 1e-3).all():
+            poses.append(pose)
+    return poses

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,7 @@ from groundtruth import se3
 from groundtruth.detections import Recording
 from groundtruth.factors import CORNERS, Between, Coordinate, Distance, Prior, Projection
 from groundtruth.graph import Graph, Solution, SolverConfig, Undetermined, solve
-from groundtruth.grow import GrowConfig, Growth, chain
+from groundtruth.grow import STAGES, GrowConfig, Growth, chain
 from groundtruth.problem import (
     Key,
     Observation,
@@ -22,7 +22,6 @@ from groundtruth.problem import (
     body_key,
     camera_key,
     make_problem,
-    moving_with_odometry,
     tag_key,
 )
 from groundtruth.tagslam_config import DEFAULT_WIGGLE, BodyEntry, TagSlamConfig
@@ -34,8 +33,12 @@ class TagSlamSettings:
     grow: GrowConfig = field(default_factory=GrowConfig)
     solver: SolverConfig = field(default_factory=lambda: SolverConfig(huber_px=None))
     """Without a robust kernel by default: that is what TagSLAM answers to a configuration of its own."""
-    growing_solver: SolverConfig = field(default_factory=lambda: SolverConfig(iterations=6, weakest=0.0))
+    growing_solver: SolverConfig = field(default_factory=lambda: SolverConfig(iterations=6, weakest=0.0, huber_px=3.0))
     """Between sweeps of growing, so that drift does not add up."""
+    solve_after_growth: float = 1.4
+    """That is done when this many times as many poses are placed, or no more can be,"""
+    solve_after: int = 300
+    """or, while there are few poses, when one that does not move is among the new ones, or so many are new."""
     corner_sigma_px: float | None = None
     """Standard deviation of a corner; None takes the configuration's `pixel_noise`."""
 
@@ -66,37 +69,102 @@ def run_tag_slam(
     """Solve a configuration on its recording. Raises BadInput for unusable input, Undetermined for a singular graph."""
     settings, progress = settings or TagSlamSettings(), progress or Silent()
     problem = make_problem(config, recording, most_frames)
+    return (
+        solve_with_amnesia(problem, settings, progress)
+        if config.amnesia
+        else solve_at_once(problem, settings, progress)
+    )
+
+
+def solve_at_once(problem: Problem, settings: TagSlamSettings, progress: Progress) -> TagSlamResult:
+    """All stamps in one graph."""
     growth = Growth(problem, settings.grow)
-    _grow(problem, growth, settings, recording, progress)
-    graph, index = build_graph(problem, growth.poses, recording, settings)
-    solution = solve(graph, settings.solver)
-    return _result(problem, growth, index, solution)
+    _grow(problem, growth, settings, progress)
+    graph, index = build_graph(problem, growth.poses, settings)
+    if not graph.projections:
+        raise Undetermined(sorted(_spoken(k) for k in growth.missing())[:3] or ["nothing"], _nothing_placed(problem))
+    return _result(problem, growth, index, solve(graph, settings.solver))
 
 
-def _grow(
-    problem: Problem, growth: Growth, settings: TagSlamSettings, recording: Recording, progress: Progress
-) -> None:
-    """Sweep until nothing more can be placed, solving what there is in between."""
-    everything = len(growth.touching)
-    for ambiguous_too in (False, True):
+def _nothing_placed(problem: Problem) -> str:
+    if not problem.observations:
+        return "no camera saw a tag of any body at a stamp that all topics share"
+    return "no tag is connected to a pose that the configuration knows; give one a pose"
+
+
+def solve_with_amnesia(problem: Problem, settings: TagSlamSettings, progress: Progress) -> TagSlamResult:
+    """Every stamp alone, with what the configuration knows and the moving bodies' poses one stamp before, each held to
+    a millimetre and a milliradian. What a stamp finds of tags and cameras is forgotten with it."""
+    seen: dict[int, list[Observation]] = {}
+    for o in problem.observations:
+        seen.setdefault(o.stamp_ns, []).append(o)
+    before: dict[Key, Float[Array, "4 4"]] = {}
+    answers: list[TagSlamResult] = []
+    for done, stamp in enumerate(problem.stamps):
+        earlier = problem.stamps[done - 1 : done]
+        alone = replace(problem, stamps=(*earlier, stamp), observations=tuple(seen.get(stamp, ())))
+        growth = Growth(alone, settings.grow)
+        growth.poses |= before
+        _grow(alone, growth, settings, Silent())
+        graph, index = build_graph(alone, growth.poses, settings)
+        graph.priors += [Prior(index[key], pose, 1e3 * np.eye(6)) for key, pose in before.items()]
+        answers.append(_result(replace(alone, stamps=(stamp,)), growth, index, solve(graph, settings.solver)))
+        now = {key: answers[-1].solution.poses[number] for key, number in index.items()}
+        before = {key: pose for key, pose in now.items() if key[0] == "body" and key[2] == stamp}
+        progress.step(done + 1, len(problem.stamps), "stamps solved")
+    if not answers or not any(len(a.reprojection_px) for a in answers):
+        raise Undetermined(["nothing"], _nothing_placed(problem))
+    return _joined(answers)
+
+
+def _joined(answers: list[TagSlamResult]) -> TagSlamResult:
+    """All stamps' bodies; everything else as it was last seen."""
+    bodies = {}
+    for name in answers[-1].bodies:
+        stamps = tuple(s for a in answers for s in a.bodies[name][0])
+        bodies[name] = (stamps, np.concatenate([a.bodies[name][1] for a in answers]))
+    return replace(
+        answers[-1],
+        bodies=bodies,
+        tags={t: pose for a in answers for t, pose in a.tags.items()},
+        reprojection_px=np.concatenate([a.reprojection_px for a in answers]),
+        unplaced=tuple(sorted({name for a in answers for name in a.unplaced})),
+    )
+
+
+def _grow(problem: Problem, growth: Growth, settings: TagSlamSettings, progress: Progress) -> None:
+    """Sweep until nothing more can be placed, bolder from stage to stage. What there is is solved in between."""
+    solved_at, fixed_at = 0, growth.fixed()
+    for stage in STAGES:
         while True:
-            placed = growth.sweep(ambiguous_too)
-            placed += _carry_odometry(problem, growth, recording)
-            progress.step(everything - len(growth.missing()), everything, "poses placed")
-            if not placed:
+            placed = growth.sweep(stage)
+            placed += _carry_odometry(problem, growth)
+            placed += _carry_rest(problem, growth) if stage.at_rest and not placed else 0
+            progress.step(growth.wanted - len(growth.missing()), growth.wanted, "poses placed")
+            new = len(growth.poses) - solved_at
+            enough = settings.solve_after if growth.fixed() == fixed_at else 1
+            due = not placed or new >= max(enough, (settings.solve_after_growth - 1) * solved_at)
+            if due and new and growth.missing():
+                solved_at, fixed_at = len(growth.poses), growth.fixed()
+                _settle(problem, growth, settings)
+            elif not placed:
                 break
-            graph, index = build_graph(problem, growth.poses, recording, settings)
-            try:
-                solution = solve(graph, settings.growing_solver)
-            except Undetermined:
-                continue  # a part that is still loose: the final solution says so if it stays
-            for key, number in index.items():
-                if key in growth.poses:
-                    growth.poses[key] = solution.poses[number]
+
+
+def _settle(problem: Problem, growth: Growth, settings: TagSlamSettings) -> None:
+    """Solve what is placed so far, so that drift does not add up."""
+    graph, index = build_graph(problem, growth.poses, settings)
+    try:
+        solution = solve(graph, settings.growing_solver)
+    except Undetermined:
+        return  # a part that is still loose: the final solution says so if it stays
+    for key, number in index.items():
+        if key in growth.poses:
+            growth.poses[key] = solution.poses[number]
 
 
 def build_graph(
-    problem: Problem, poses: Mapping[Key, Float[Array, "4 4"]], recording: Recording, settings: TagSlamSettings
+    problem: Problem, poses: Mapping[Key, Float[Array, "4 4"]], settings: TagSlamSettings
 ) -> tuple[Graph, dict[Key, int]]:
     """All factors whose poses are placed."""
     config = problem.config
@@ -111,7 +179,7 @@ def build_graph(
             camera, rig, body, tag = (index[k] for k in keys)
             eye = _eye(config, o, camera, graph, eyes)
             graph.projections.append(Projection(o.camera, eye, rig, body, tag, o.tag.size_m, o.corners_px, sigma))
-    _add_odometry(problem, graph, index, recording)
+    _add_odometry(problem, graph, index)
     _add_measurements(problem, graph, index)
     return graph, index
 
@@ -135,9 +203,7 @@ def _eye(config: TagSlamConfig, o: Observation, camera: int, graph: Graph, eyes:
 
 def _add_priors(problem: Problem, graph: Graph, index: Mapping[Key, int]) -> None:
     known: list[tuple[Key, Any]] = []
-    for body in problem.config.bodies:
-        if body.is_static:
-            known.append((("body", body.name, 0), body.pose))
+    known += [(body_key(b, 0), b.pose) for b in problem.config.bodies if b.is_static]
     known += [(camera_key(c.name), c.pose) for c in problem.config.cameras]
     known += [(tag_key(t), entry.pose) for t, entry in problem.tags.items()]
     for key, pose in known:
@@ -145,24 +211,24 @@ def _add_priors(problem: Problem, graph: Graph, index: Mapping[Key, int]) -> Non
             graph.priors.append(Prior(index[key], pose.pose, pose.root_information))
 
 
-def _odometry_steps(
-    problem: Problem, body: BodyEntry, odometry: Any
-) -> list[tuple[int, int, Float[Array, "4 4"], Array]]:
+def _with_odometry(problem: Problem) -> list[BodyEntry]:
+    return [b for b in problem.config.bodies if b.name in problem.odometry]
+
+
+def _odometry_steps(problem: Problem, body: BodyEntry) -> list[tuple[int, int, Float[Array, "4 4"], Float[Array, "6"]]]:
     """(stamp before, stamp after, relative pose of the body, standard deviations (6,)) between answered stamps.
 
-    The noise is TagSLAM's: by how much a step departs from constant velocity, at least acceleration x dt^2.
+    The noise is TagSLAM's: by how much a step departs from constant velocity, within acceleration x dt^2.
     """
-    stamps, poses = odometry
-    place = {int(s): i for i, s in enumerate(stamps)}
-    here = [s for s in problem.stamps if s in place]
-    T, out = body.body_from_odom, []
+    poses, T, out = problem.odometry[body.name], body.body_from_odom, []
+    stamps = list(poses)
     last_w, last_v = np.zeros(3), np.zeros(3)
-    for before, after in zip(here[:-1], here[1:], strict=True):
-        delta = T @ np.linalg.inv(poses[place[before]]) @ poses[place[after]] @ np.linalg.inv(T)
+    for before, after in zip(stamps[:-1], stamps[1:], strict=True):
+        delta = T @ np.linalg.inv(poses[before]) @ poses[after] @ np.linalg.inv(T)
         dt = max((after - before) / 1e9, 1e-3)
         turn, shift = se3.log(delta[None])[0][:3], delta[:3, 3]
-        rotation = max(float(np.linalg.norm(turn - last_w * dt)), body.odom_angular_acceleration * dt**2)
-        position = max(float(np.linalg.norm(shift - last_v * dt)), body.odom_acceleration * dt**2)
+        rotation = _within(np.linalg.norm(turn - last_w * dt) / dt**2, body.odom_angular_acceleration) * dt**2
+        position = _within(np.linalg.norm(shift - last_v * dt) / dt**2, body.odom_acceleration) * dt**2
         last_w, last_v = turn / dt, shift / dt
         if body.odom_noise is not None:
             rotation, position = body.odom_noise
@@ -170,9 +236,13 @@ def _odometry_steps(
     return out
 
 
-def _add_odometry(problem: Problem, graph: Graph, index: Mapping[Key, int], recording: Recording) -> None:
-    for body, odometry in moving_with_odometry(problem.config, recording):
-        for before, after, delta, sigma in _odometry_steps(problem, body, odometry):
+def _within(value: float | np.floating, least_and_most: tuple[float, float]) -> float:
+    return min(max(float(value), least_and_most[0]), least_and_most[1])
+
+
+def _add_odometry(problem: Problem, graph: Graph, index: Mapping[Key, int]) -> None:
+    for body in _with_odometry(problem):
+        for before, after, delta, sigma in _odometry_steps(problem, body):
             a, b = index.get(body_key(body, before)), index.get(body_key(body, after))
             if a is not None and b is not None:
                 graph.betweens.append(Between(a, b, delta, np.diag(1 / sigma)))
@@ -186,16 +256,35 @@ def _add_odometry(problem: Problem, graph: Graph, index: Mapping[Key, int], reco
             graph.betweens.append(Between(a, b, np.eye(4), np.diag([1 / turn] * 3 + [1 / shift] * 3)))
 
 
-def _carry_odometry(problem: Problem, growth: Growth, recording: Recording) -> int:
+def _carry_odometry(problem: Problem, growth: Growth) -> int:
     """Place poses next to placed ones along the odometry; how many were."""
     placed = 0
-    for body, odometry in moving_with_odometry(problem.config, recording):
-        steps = _odometry_steps(problem, body, odometry)
+    for body in _with_odometry(problem):
+        steps = _odometry_steps(problem, body)
         both_ways = [(a, b, d) for a, b, d, _ in steps] + [(b, a, np.linalg.inv(d)) for a, b, d, _ in reversed(steps)]
         for known, new, delta in both_ways:
             before, after = growth.poses.get(body_key(body, known)), body_key(body, new)
             if before is not None and after not in growth.poses:
                 growth.poses[after] = before @ delta
+                placed += 1
+    return placed
+
+
+def _carry_rest(problem: Problem, growth: Growth) -> int:
+    """Place a body with fake odometry where it was, or will be, one stamp away; how many poses were placed.
+
+    One pose a body in each direction from every gap's end: what comes after may connect by its tags.
+    """
+    placed = 0
+    for body in problem.config.bodies:
+        if body.fake_odom_noise is None or body.is_static:
+            continue
+        keys = [body_key(body, s) for s in problem.stamps]
+        known = [k in growth.poses for k in keys]
+        for i, key in enumerate(keys):
+            beside = [j for j in (i - 1, i + 1) if 0 <= j < len(keys) and known[j]]
+            if not known[i] and beside:
+                growth.poses[key] = growth.poses[keys[beside[0]]]
                 placed += 1
     return placed
 
@@ -238,7 +327,8 @@ def _result(problem: Problem, growth: Growth, index: Mapping[Key, int], solution
     bodies, static = {}, {}
     for body in problem.config.bodies:
         if body.is_static:
-            static[body.name] = poses[("body", body.name, 0)]
+            if body_key(body, 0) in poses:
+                static[body.name] = poses[body_key(body, 0)]
             continue
         stamps = tuple(s for s in problem.stamps if body_key(body, s) in poses)
         stack = np.stack([poses[body_key(body, s)] for s in stamps]) if stamps else np.zeros((0, 4, 4))

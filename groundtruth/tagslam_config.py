@@ -1,34 +1,30 @@
 """Reading a TagSLAM configuration as it is: cameras.yaml, camera_poses.yaml and tagslam.yaml.
 
-Rotations there are axis-angle vectors, `R` is an upper-triangular root information matrix in (rotation, translation)
-order, and the tag frame has y up on the printed tag.
+The tag frame has y up on the printed tag. What TagSLAM reads and does not use (`max_hamming_distance` of a body, `bits`
+of a tag) is not used here either; settings of its optimiser have no counterpart.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from jaxtyping import Float
 from numpy import ndarray as Array
 
+from groundtruth.tagslam_yaml import NoisyPose, load, matrix, noisy, time_ns
 from recordings.errors import BadInput
-from recordings.geometry import CameraModel, rotation_exp
+from recordings.geometry import COEFFICIENTS, CameraModel, DistortionModel
 
-MODELS = {"radtan": "brown-conrady", "plumb_bob": "brown-conrady", "equidistant": "fisheye", "fisheye": "fisheye"}
+MODELS: dict[str, DistortionModel] = {
+    **dict.fromkeys(("radtan", "rad_tan", "plumb_bob"), "brown-conrady"),
+    **dict.fromkeys(("rational", "rational_polynomial"), "rational"),
+    **dict.fromkeys(("equidistant", "equi", "fisheye"), "fisheye"),
+}
 DEFAULT_WIGGLE = 1e-5
-
-
-@dataclass(frozen=True, eq=False)
-class NoisyPose:
-    """A pose (4x4) and the root information (6x6) of what is known about it."""
-
-    pose: Float[Array, "4 4"]
-    root_information: Float[Array, "6 6"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,11 +56,11 @@ class BodyEntry:
     default_tag_size_m: float
     tags: Mapping[int, TagEntry]
     ignored: frozenset[int]
-    max_hamming: int
     odom_topic: str | None = None
     body_from_odom: Float[Array, "4 4"] = field(default_factory=lambda: np.eye(4))
-    odom_acceleration: float = 5.0
-    odom_angular_acceleration: float = 5.0
+    odom_acceleration: tuple[float, float] = (5.0, 50.0)
+    """Least and largest noise of odometry, m/s^2: a step of dt seconds has this times dt^2."""
+    odom_angular_acceleration: tuple[float, float] = (5.0, 50.0)
     odom_noise: tuple[float, float] | None = None
     fake_odom_noise: tuple[float, float] | None = None
 
@@ -80,18 +76,35 @@ class Remap:
     end_ns: int
 
 
+@dataclass(frozen=True)
+class Squash:
+    """Tags to leave out: at one stamp (None: always), of one camera (None: all)."""
+
+    tags: frozenset[int]
+    stamp_ns: int | None
+    camera: str | None
+
+
 @dataclass(frozen=True, eq=False)
 class TagSlamConfig:
+    """`approximate_sync`: stamps of the topics need not be equal. `amnesia`: every stamp is solved anew, from what the
+    configuration knows and the moving bodies' poses before. `minimum_tag_area_px2` is of twice a tag's area, as TagSLAM
+    counts it."""
+
     cameras: tuple[CameraEntry, ...]
     bodies: tuple[BodyEntry, ...]
     default_body: str | None
     pixel_noise: float
     remaps: tuple[Remap, ...]
-    squashed: Mapping[int, frozenset[int]]
+    squashes: tuple[Squash, ...]
     planes: tuple[Mapping[str, Any], ...]
     distances: tuple[Mapping[str, Any], ...]
     coordinates: tuple[Mapping[str, Any], ...]
     max_hamming: int
+    approximate_sync: bool = False
+    amnesia: bool = False
+    minimum_tag_area_px2: float = 0.0
+    minimum_viewing_deg: float = 20.0
 
     def body(self, name: str) -> BodyEntry:
         for body in self.bodies:
@@ -102,9 +115,9 @@ class TagSlamConfig:
 
 def read_config(folder: Path) -> TagSlamConfig:
     """Read and check the three files. Raises BadInput naming the file, the entry and what was wanted."""
-    cameras = _load(folder / "cameras.yaml")
-    poses = _load(folder / "camera_poses.yaml") if (folder / "camera_poses.yaml").exists() else {}
-    main = _load(folder / "tagslam.yaml")
+    cameras = load(folder / "cameras.yaml")
+    poses = load(folder / "camera_poses.yaml") if (folder / "camera_poses.yaml").exists() else {}
+    main = load(folder / "tagslam.yaml")
     try:
         return _config(cameras, poses, main)
     except (KeyError, TypeError, ValueError, AttributeError) as wrong:
@@ -112,21 +125,25 @@ def read_config(folder: Path) -> TagSlamConfig:
 
 
 def _config(cameras: Mapping[str, Any], poses: Mapping[str, Any], main: Mapping[str, Any]) -> TagSlamConfig:
-    parameters = main.get("tagslam_parameters", {})
-    defaults = main.get("body_defaults", {})
+    parameters = main.get("tagslam_parameters") or {}
+    defaults = main.get("body_defaults") or {}
     bodies = tuple(_body(name, entry, defaults) for item in main["bodies"] for name, entry in item.items())
     _refuse_doubles(bodies)
     return TagSlamConfig(
-        cameras=tuple(_camera(name, entry, poses.get(name)) for name, entry in cameras.items()),
+        cameras=tuple(_camera(name, cameras[name], poses.get(name)) for name in sorted(cameras, key=_by_number)),
         bodies=bodies,
         default_body=main.get("default_body"),
         pixel_noise=float(parameters.get("pixel_noise", 1.0)),
         remaps=tuple(_remaps(main.get("tag_id_remap") or [])),
-        squashed=_squashed(main.get("squash") or []),
+        squashes=tuple(_squash(s) for s in main.get("squash") or []),
         planes=_measurements(main.get("plane_measurements")),
         distances=_measurements(main.get("distance_measurements")),
         coordinates=_measurements(main.get("coordinate_measurements")),
         max_hamming=int(main.get("max_hamming_distance", 100)),
+        approximate_sync=bool(parameters.get("use_approximate_sync", False)),
+        amnesia=bool(main.get("amnesia", False)),
+        minimum_tag_area_px2=float(parameters.get("minimum_tag_area", 0)),
+        minimum_viewing_deg=float(parameters.get("minimum_viewing_angle", 20.0)),
     )
 
 
@@ -141,6 +158,12 @@ def _refuse_doubles(bodies: tuple[BodyEntry, ...]) -> None:
             owner[tag] = body.name
 
 
+def _by_number(name: str) -> tuple[int, str]:
+    """cam2 before cam10: the first camera's stamp is the answer's."""
+    digits = "".join(c for c in name if c.isdigit())
+    return (int(digits) if digits else 0, name)
+
+
 def _camera(name: str, entry: Mapping[str, Any], pose: Mapping[str, Any] | None) -> CameraEntry:
     fx, fy, cx, cy = (float(v) for v in entry["intrinsics"])
     model = MODELS.get(str(entry.get("distortion_model", "radtan")))
@@ -148,161 +171,118 @@ def _camera(name: str, entry: Mapping[str, Any], pose: Mapping[str, Any] | None)
         raise BadInput(
             f"cameras.yaml: {name} has distortion_model '{entry['distortion_model']}'; wanted {list(MODELS)}"
         )
-    coefficients = [float(v) for v in entry.get("distortion_coeffs", [])]
-    wanted = 5 if model == "brown-conrady" else 4
-    coefficients = (coefficients + [0.0] * wanted)[:wanted]
+    wanted = COEFFICIENTS[model]
+    coefficients = ([float(v) for v in entry.get("distortion_coeffs") or []] + [0.0] * wanted)[:wanted]
     width, height = (int(v) for v in entry["resolution"])
     K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
-    camera = CameraModel(name, width, height, K, model, tuple(coefficients))  # type: ignore[arg-type]
+    camera = CameraModel(name, width, height, K, model, tuple(coefficients))
     wiggle = (
         float(entry.get("wiggle_rotation", DEFAULT_WIGGLE)),
         float(entry.get("wiggle_translation", DEFAULT_WIGGLE)),
     )
     topic = str(entry.get("tagtopic", ""))
-    known = _camera_pose(pose["pose"]) if pose and "pose" in pose else None
+    known = noisy(pose["pose"], 1e-5, 1e-5) if pose and "pose" in pose else None
     return CameraEntry(
         name, camera, topic if topic.startswith("/") else f"/{topic}", str(entry["rig_body"]), known, wiggle
     )
 
 
-def _camera_pose(entry: Mapping[str, Any]) -> NoisyPose:
-    if "R" in entry:
-        root = np.array(entry["R"], dtype=np.float64).reshape(6, 6)
-        return NoisyPose(_matrix(entry), root)
-    return _noisy(entry, 1e-5, 1e-5)
-
-
 def _body(name: str, entry: Mapping[str, Any], defaults: Mapping[str, Any]) -> BodyEntry:
     size_m = float(entry.get("default_tag_size", 0.0))
-    position_noise = float(defaults.get("position_noise", 0.05))
-    rotation_noise = float(defaults.get("rotation_noise", 0.01))
-    tags = {}
-    for tag in entry.get("tags") or []:
-        one = _tag(tag, size_m, entry, position_noise, rotation_noise)
-        tags[one.tag_id] = one
-    if entry.get("type") == "board":
-        tags.update(_board(entry["board"]))
-    odom = (float(entry.get("odom_rotation_noise", -1)), float(entry.get("odom_translation_noise", -1)))
-    fake = (float(entry.get("fake_odom_rotation_noise", -1)), float(entry.get("fake_odom_translation_noise", -1)))
+    noises = (float(defaults.get("rotation_noise", 0.01)), float(defaults.get("position_noise", 0.05)))
+    if "pose" in entry and not entry["is_static"]:
+        raise BadInput(f"tagslam.yaml: body '{name}' moves, yet it has a pose; wanted is_static: true, or no pose")
     return BodyEntry(
         name=name,
         is_static=bool(entry["is_static"]),
-        pose=_noisy(entry["pose"], rotation_noise, position_noise) if "pose" in entry else None,
+        pose=noisy(entry["pose"], *noises) if "pose" in entry else None,
         default_tag_size_m=size_m,
-        tags=tags,
+        tags=_body_tags(name, entry, size_m, noises),
         ignored=frozenset(int(t) for t in entry.get("ignore_tags") or []),
-        max_hamming=int(entry.get("max_hamming_distance", 2)),
-        odom_topic=entry.get("odom_topic"),
-        body_from_odom=_matrix(entry["T_body_odom"]) if "T_body_odom" in entry else np.eye(4),
-        odom_acceleration=float(entry.get("odom_acceleration", 5.0)),
-        odom_angular_acceleration=float(entry.get("odom_angular_acceleration", 5.0)),
-        odom_noise=odom if min(odom) > 0 else None,
-        fake_odom_noise=fake if min(fake) > 0 else None,
+        odom_topic=_slashed(entry.get("odom_topic")),
+        body_from_odom=matrix(entry["T_body_odom"]) if "T_body_odom" in entry else np.eye(4),
+        odom_acceleration=_range(entry, "odom_acceleration"),
+        odom_angular_acceleration=_range(entry, "odom_angular_acceleration"),
+        odom_noise=_both(entry, "odom_rotation_noise", "odom_translation_noise"),
+        fake_odom_noise=_both(entry, "fake_odom_rotation_noise", "fake_odom_translation_noise"),
     )
 
 
-def _tag(
-    tag: Mapping[str, Any], size_m: float, body: Mapping[str, Any], position_noise: float, rotation_noise: float
-) -> TagEntry:
-    pose = _noisy(tag["pose"], rotation_noise, position_noise) if "pose" in tag else None
-    over = (float(body.get("override_tag_rotation_noise", -1)), float(body.get("override_tag_position_noise", -1)))
-    if pose is not None and max(over) > 0:
-        rotation = np.where(over[0] > 0, over[0], 1 / np.diag(pose.root_information)[:3])
-        position = np.where(over[1] > 0, over[1], 1 / np.diag(pose.root_information)[3:])
-        pose = NoisyPose(
-            pose.pose, np.diag(1 / np.concatenate([np.broadcast_to(rotation, 3), np.broadcast_to(position, 3)]))
-        )
+def _slashed(topic: Any) -> str | None:
+    return None if not topic else str(topic) if str(topic).startswith("/") else f"/{topic}"
+
+
+def _range(entry: Mapping[str, Any], name: str) -> tuple[float, float]:
+    """The least and the largest noise; the older name without `_noise_min` counts where the newer is not given."""
+    least = float(entry.get(f"{name}_noise_min", entry.get(name, 5.0)))
+    return least, float(entry.get(f"{name}_noise_max", 10 * least))
+
+
+def _both(entry: Mapping[str, Any], rotation: str, translation: str) -> tuple[float, float] | None:
+    """Two noises that count only together."""
+    noise = (float(entry.get(rotation, -1)), float(entry.get(translation, -1)))
+    return noise if min(noise) > 0 else None
+
+
+def _body_tags(
+    name: str, entry: Mapping[str, Any], size_m: float, noises: tuple[float, float]
+) -> Mapping[int, TagEntry]:
+    kind = str(entry.get("type", "simple"))
+    if kind in ("board", "staggered_board"):
+        found = _board(entry[kind], staggered=kind == "staggered_board")
+    elif kind in ("simple", "camera_rig"):
+        found = [_tag(tag, size_m, noises) for tag in entry.get("tags") or []]
+    else:
+        raise BadInput(f"tagslam.yaml: body '{name}' has type '{kind}'; wanted one of simple, board, staggered_board")
+    over = _both(entry, "override_tag_rotation_noise", "override_tag_position_noise")
+    return {t.tag_id: t if over is None or t.pose is None else replace(t, pose=_blurred(t.pose, over)) for t in found}
+
+
+def _blurred(pose: NoisyPose, noise: tuple[float, float]) -> NoisyPose:
+    return NoisyPose(pose.pose, np.diag([1 / noise[0]] * 3 + [1 / noise[1]] * 3))
+
+
+def _tag(tag: Mapping[str, Any], size_m: float, noises: tuple[float, float]) -> TagEntry:
     size = float(tag.get("size", size_m))
     if size <= 0:
         raise BadInput(f"tagslam.yaml: tag {tag['id']} has no size; wanted a positive number of metres")
-    return TagEntry(int(tag["id"]), size, pose)
+    return TagEntry(int(tag["id"]), size, noisy(tag["pose"], *noises) if "pose" in tag else None)
 
 
-def _board(board: Mapping[str, Any]) -> dict[int, TagEntry]:
-    """Tags in rows and columns; `pose` is board_from_body. Spacing is the gap in tag sizes."""
+def _board(board: Mapping[str, Any], staggered: bool) -> list[TagEntry]:
+    """Tags in rows and columns; `pose` is board_from_body. Spacing is the gap in tag sizes.
+
+    A staggered board has its tags on the black fields of a chessboard, rows downwards.
+    """
     size_m, pitch = float(board["tag_size"]), float(board["tag_size"]) * (1 + float(board["tag_spacing"]))
-    body_from_board = np.linalg.inv(_matrix(board["pose"])) if "pose" in board else np.eye(4)
-    noise = (float(board.get("tag_rotation_noise", 1e-5)), float(board.get("tag_position_noise", 1e-5)))
+    body_from_board = np.linalg.inv(matrix(board["pose"])) if "pose" in board else np.eye(4)
+    noise = (float(board.get("tag_rotation_noise", 0.0)), float(board.get("tag_position_noise", 0.0)))
     root = np.diag([1 / max(noise[0], 1e-6)] * 3 + [1 / max(noise[1], 1e-6)] * 3)
-    tags, number = {}, int(board["tag_start_id"])
+    tags, number = [], int(board["tag_start_id"])
     for row in range(int(board["tag_rows"])):
-        for column in range(int(board["tag_columns"])):
+        for column in range(row % 2 if staggered else 0, int(board["tag_columns"]), 2 if staggered else 1):
             at = np.eye(4)
-            at[:2, 3] = column * pitch, row * pitch
-            tags[number] = TagEntry(number, size_m, NoisyPose(body_from_board @ at, root))
+            at[:2, 3] = column * pitch, -row * pitch if staggered else row * pitch
+            tags.append(TagEntry(number, size_m, NoisyPose(body_from_board @ at, root)))
             number += 1
     return tags
-
-
-def _noisy(entry: Mapping[str, Any], rotation_noise: float, position_noise: float) -> NoisyPose:
-    turn = _xyz(entry["rotation_noise"]) if "rotation_noise" in entry else np.full(3, rotation_noise)
-    shift = _xyz(entry["position_noise"]) if "position_noise" in entry else np.full(3, position_noise)
-    return NoisyPose(_matrix(entry), np.diag(1 / np.concatenate([turn, shift])))
-
-
-def _matrix(entry: Mapping[str, Any]) -> Float[Array, "4 4"]:
-    out = np.eye(4)
-    out[:3, :3] = rotation_exp(_xyz(entry["rotation"]))
-    out[:3, 3] = _xyz(entry["position"])
-    return out
-
-
-def _xyz(entry: Mapping[str, Any]) -> Float[Array, "3"]:
-    return np.array([float(entry["x"]), float(entry["y"]), float(entry["z"])])
 
 
 def _remaps(entries: list[Mapping[str, Any]]) -> list[Remap]:
     out = []
     for entry in entries:
         for remap in entry["remaps"]:
-            start, end = _time_ns(remap.get("start_time", 0)), _time_ns(remap.get("end_time", 1e10))
+            start, end = time_ns(remap.get("start_time", 0)), time_ns(remap.get("end_time", 1e10))
             out.append(Remap(int(entry["id"]), int(remap["remap_id"]), remap.get("camera"), start, end))
     return out
 
 
-def _squashed(entries: list[Mapping[str, Any]]) -> dict[int, frozenset[int]]:
-    """Tags to leave out by stamp; key -1 with a camera would squash it everywhere, which is refused as unsupported."""
-    out: dict[int, frozenset[int]] = {}
-    for entry in entries:
-        if "time" not in entry:
-            raise BadInput("tagslam.yaml: squash entries without a time are not supported; name the stamps")
-        at = _time_ns(entry["time"])
-        out[at] = out.get(at, frozenset()) | frozenset(int(t) for t in entry["tags"])
-    return out
+def _squash(entry: Mapping[str, Any]) -> Squash:
+    at, camera = entry.get("time"), entry.get("camera")
+    if at is None and camera is None:
+        raise BadInput("tagslam.yaml: a squash entry names neither a time nor a camera; wanted at least one of them")
+    return Squash(frozenset(int(t) for t in entry["tags"]), None if at is None else time_ns(at), camera)
 
 
 def _measurements(entries: Any) -> tuple[Mapping[str, Any], ...]:
     return tuple({"name": name, **values} for item in entries or [] for name, values in item.items())
-
-
-def _time_ns(value: Any) -> int:
-    """Seconds since 1970 as text or number to nanoseconds, without losing digits where text was given."""
-    text = str(value)
-    if "e" in text.lower():
-        return int(float(text) * 1e9)
-    whole, _, part = text.partition(".")
-    return int(whole) * 1_000_000_000 + int((part + "000000000")[:9] or 0)
-
-
-class _TextLoader(yaml.SafeLoader):
-    """Keeps floats as text where they are times: nanoseconds do not fit into a double."""
-
-
-def _load(path: Path) -> dict[str, Any]:
-    try:
-        text = path.read_text()
-    except OSError as refused:
-        raise BadInput(f"{path} cannot be read: {refused.strerror}; wanted a TagSLAM configuration folder") from refused
-    try:
-        document = yaml.load(_times_as_text(text), Loader=_TextLoader)
-    except yaml.YAMLError as wrong:
-        raise BadInput(f"{path} is no readable YAML ({wrong})") from wrong
-    if not isinstance(document, dict):
-        raise BadInput(f"{path}: wanted a mapping at the top, found {type(document).__name__}")
-    return document
-
-
-def _times_as_text(text: str) -> str:
-    import re
-
-    return re.sub(r"((?:start_|end_)?time:\s*)(\d+\.\d+)", r'\1"\2"', text)

@@ -53,7 +53,7 @@ def tag_pose(turn: list[float], at: list[float]) -> np.ndarray:
 
 def test_one_of_the_two_planar_solutions_is_the_true_pose():
     true = tag_pose([0.5, -0.3, 0.2], [0.1, -0.05, 0.8])
-    poses, errors = planar_poses(CAMERA, 0.1, view(true, 0.1))
+    ((poses, errors),) = planar_poses(CAMERA, np.array([0.1]), view(true, 0.1)[None])
     assert len(poses) == 2
     assert errors[0] < 1e-3
     np.testing.assert_allclose(poses[0], true, atol=1e-5)
