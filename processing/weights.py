@@ -22,8 +22,10 @@ Shapes = Mapping[str, tuple[int, ...]]
 
 @dataclass(frozen=True)
 class WeightFile:
-    """A published file: the names under which it is looked for (the first one there is taken) and where it is from."""
+    """A published file: what asks for it, as typed; the names under which it is looked for (the first one there is
+    taken); where it comes from."""
 
+    option: str
     names: tuple[str, ...]
     source: str
     megabytes: int
@@ -32,12 +34,31 @@ class WeightFile:
         return f"{' or '.join(self.names)} (about {self.megabytes} MB) of {self.source}"
 
 
-def find_weights(file: WeightFile, folder: Path | None, option: str) -> Path:
-    """The file in the user's folder. `option` is what asked for it, as typed. Raises BadInput."""
+XMEM = WeightFile(
+    "--segmenter xmem", ("XMem-s012.pth", "XMem.pth"), "release v1.0 of the GitHub project hkchengrex/XMem", 249
+)
+LOFTR = WeightFile(
+    "--matcher loftr",
+    ("loftr_outdoor.ckpt",),
+    "LoFTR's outdoor model as kornia has it (kornia/loftr, Hugging Face)",
+    46,
+)
+XFEAT = WeightFile(
+    "--matcher xfeat", ("xfeat.pt",), "the folder weights of the GitHub project verlab/accelerated_features", 6
+)
+LIGHTGLUE = WeightFile(
+    "--matcher lightglue", ("sift_lightglue.pth",), "release v0.1_arxiv of the GitHub project cvg/LightGlue", 48
+)
+PUBLISHED = {"xmem": XMEM, "loftr": LOFTR, "xfeat": XFEAT, "lightglue": LIGHTGLUE}
+"""By the name of the backend that reads it."""
+
+
+def find_weights(file: WeightFile, folder: Path | None) -> Path:
+    """The file in the user's folder. Raises BadInput."""
     if folder is None:
         raise BadInput(
-            f"{option} needs learned weights and no --weights DIR was given; "
-            f"wanted: a folder that holds {file}. Get it there, then run with {option} --weights DIR"
+            f"{file.option} needs learned weights and no --weights DIR was given; "
+            f"wanted: a folder that holds {file}. Get it there, then run with {file.option} --weights DIR"
         )
     if not folder.is_dir():
         raise BadInput(f"--weights {folder}: there is no such folder; wanted: a folder that holds {file}")
@@ -45,7 +66,7 @@ def find_weights(file: WeightFile, folder: Path | None, option: str) -> Path:
         if (folder / name).is_file():
             return folder / name
     there = ", ".join(sorted(p.name for p in folder.iterdir())[:8]) or "nothing"
-    raise BadInput(f"{option}: found {there} in {folder}; wanted: {file}. Put it there, under that name")
+    raise BadInput(f"{file.option}: found {there} in {folder}; wanted: {file}. Put it there, under that name")
 
 
 def read_weights(path: Path, file: WeightFile, inside: str | None = None) -> dict[str, Tensor]:

@@ -12,10 +12,8 @@ from pathlib import Path
 import torch
 
 from processing.segment.xmem_network import XMemNetwork
-from processing.weights import WeightFile, check_layers, find_weights, read_weights
+from processing.weights import XMEM, check_layers, find_weights, read_weights
 
-XMEM = WeightFile(("XMem-s012.pth", "XMem.pth"), "release v1.0 of the GitHub project hkchengrex/XMem", 249)
-OPTION = "--segmenter xmem"
 COUNTERS = "num_batches_tracked"
 """Layers of this name count training steps: files may leave them out, and they change nothing."""
 
@@ -28,7 +26,7 @@ def published_layers() -> dict[str, tuple[int, ...]]:
 
 def load_network(folder: Path | None) -> XMemNetwork:
     """The published network with the weights in a user's folder, ready to run. Raises BadInput."""
-    path = find_weights(XMEM, folder, OPTION)
+    path = find_weights(XMEM, folder)
     stored = read_weights(path, XMEM)
     layers = published_layers()
     counters = {n: torch.zeros((), dtype=torch.int64) for n in layers if n.endswith(COUNTERS)}

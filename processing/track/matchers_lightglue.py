@@ -15,11 +15,8 @@ from numpy import ndarray as Array
 from processing.track.features import Features
 from processing.track.matchers import PictureConfig, no_pairs, open_kornia, picture_of, points_under
 from processing.track.views import ViewStore
-from processing.weights import WeightFile, check_layers, find_weights, read_weights
+from processing.weights import LIGHTGLUE, check_layers, find_weights, read_weights
 from recordings.errors import BadInput
-
-LIGHTGLUE = WeightFile(("sift_lightglue.pth",), "release v0.1_arxiv of the GitHub project cvg/LightGlue", 48)
-OPTION = "--matcher lightglue"
 
 
 @dataclass(frozen=True)
@@ -58,8 +55,8 @@ class LightGlue:
     @staticmethod
     def from_weights(folder: Path | None, config: LightGlueConfig | None = None, device: str = "cpu") -> LightGlue:
         """With the published weights in a user's folder. Raises BadInput that says where they come from."""
-        path = find_weights(LIGHTGLUE, folder, OPTION)
-        network = empty_network(open_kornia(OPTION))
+        path = find_weights(LIGHTGLUE, folder)
+        network = empty_network(open_kornia(LIGHTGLUE.option))
         layers = network.state_dict()
         derived = {"confidence_thresholds": layers["confidence_thresholds"]}
         stored = derived | {_todays_name(n): t for n, t in read_weights(path, LIGHTGLUE).items()}

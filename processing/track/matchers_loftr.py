@@ -14,11 +14,9 @@ from numpy import ndarray as Array
 from processing.track.features import Features
 from processing.track.matchers import Picture, PictureConfig, no_pairs, open_kornia, picture_of, points_under
 from processing.track.views import ViewStore
-from processing.weights import WeightFile, check_layers, find_weights, read_weights
+from processing.weights import LOFTR, check_layers, find_weights, read_weights
 from recordings.errors import BadInput
 
-LOFTR = WeightFile(("loftr_outdoor.ckpt",), "LoFTR's outdoor model as kornia has it (kornia/loftr on Hugging Face)", 46)
-OPTION = "--matcher loftr"
 HALF_CELL = 0.5
 """LoFTR's pixel centres lie half a pixel further right and down than ours."""
 
@@ -66,8 +64,8 @@ class Loftr:
     @staticmethod
     def from_weights(folder: Path | None, config: LoftrConfig | None = None, device: str = "cpu") -> Loftr:
         """With the published weights in a user's folder. Raises BadInput that says where they come from."""
-        path = find_weights(LOFTR, folder, OPTION)
-        network = open_kornia(OPTION).LoFTR(pretrained=None)
+        path = find_weights(LOFTR, folder)
+        network = open_kornia(LOFTR.option).LoFTR(pretrained=None)
         stored = {n.removeprefix("matcher."): t for n, t in read_weights(path, LOFTR, inside="state_dict").items()}
         check_layers(stored, {n: tuple(t.shape) for n, t in network.state_dict().items()}, path, LOFTR)
         network.load_state_dict(stored)

@@ -13,10 +13,7 @@ from numpy import ndarray as Array
 from processing.track.features import Features
 from processing.track.matchers import PictureConfig, no_pairs, open_kornia, picture_of, points_under
 from processing.track.views import ViewStore
-from processing.weights import WeightFile, check_layers, find_weights, read_weights
-
-XFEAT = WeightFile(("xfeat.pt",), "the folder weights of the GitHub project verlab/accelerated_features", 6)
-OPTION = "--matcher xfeat"
+from processing.weights import XFEAT, check_layers, find_weights, read_weights
 
 
 @dataclass(frozen=True)
@@ -43,8 +40,8 @@ class XFeat:
     @staticmethod
     def from_weights(folder: Path | None, config: XFeatConfig | None = None, device: str = "cpu") -> XFeat:
         """With the published weights in a user's folder. Raises BadInput that says where they come from."""
-        path = find_weights(XFEAT, folder, OPTION)
-        network = open_kornia(OPTION).XFeat()
+        path = find_weights(XFEAT, folder)
+        network = open_kornia(XFEAT.option).XFeat()
         stored = read_weights(path, XFEAT)
         check_layers(stored, {n: tuple(t.shape) for n, t in network.net.state_dict().items()}, path, XFEAT)
         network.net.load_state_dict(stored)
