@@ -2,29 +2,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from jaxtyping import Bool
+from numpy import ndarray as Array
 
+from processing.given_masks import chosen_masks
+from processing.rig import CAMERA, Rig, RobotOfSession, rig_stage
 from processing.segment.background import BackgroundSegmenter
+from processing.segment.robot_frames import RobotFrames
+from processing.segment.robot_view import RobotView
 from processing.segment.segmenter import Example
 from processing.segment.static_scene import StaticScene, calibrated_table_depth, learn_scene, sample_positions
 from processing.stage import Counts, Done
 from recordings.records import RgbdFrame
 from recordings.results import write_masks
+from recordings.robot import panda
 
 if TYPE_CHECKING:
     from processing.pipeline import Run
-
-CAMERA = "d455"
 
 
 def static_scene(run: Run) -> Done:
     """Stage `scene`: what the camera sees without the object, from frames of all tosses of the run."""
     inputs = {name: run.keys[name] for name in ("calibration", *(f"toss_{t:02d}" for t in run.tosses))}
-    return run.store.run("scene", 1, run.config.scene, inputs, lambda folder: _learn_scene(run, folder))
+    return run.store.run("scene", 2, run.config.scene, inputs, lambda folder: _learn_scene(run, folder))
 
 
 def _learn_scene(run: Run, folder: Path) -> Counts:
@@ -37,35 +43,70 @@ def _learn_scene(run: Run, folder: Path) -> Counts:
             progress.step(done, len(chosen))
             yield streams[toss][position]
 
-    scene = learn_scene(frames(), calibrated_table_depth(run.session.calibration, CAMERA), run.config.scene)
-    with open(folder / "scene.npz", "wb") as out:
-        np.savez(out, **vars(scene))
-    return {"frames": len(chosen), "pixels_with_depth": int((scene.depth_m > 0).sum())}
+    hidden = _hidden_by_robot(run, [(run.tosses[t], int(streams[t].times_ns[i])) for t, i in chosen])
+    table = calibrated_table_depth(run.session.calibration, CAMERA)
+    scene = learn_scene(frames(), table, run.config.scene, hidden)
+    scene.write(folder)
+    return {
+        "frames": len(chosen),
+        "pixels_with_depth": int((scene.depth_m > 0).sum()),
+        "known_share": round(float(scene.known.mean()), 4),
+        "robot_left_out": hidden is not None,
+    }
+
+
+def _hidden_by_robot(run: Run, at: Sequence[tuple[int, int]]) -> list[Bool[Array, "h w"]] | None:
+    """Where the robot, or what it holds, may stand in front of the scene, at (toss, time); None without a robot."""
+    robot = RobotOfSession(run.session)
+    if robot.missing(run.tosses) is not None:
+        return None
+    camera, settings = run.session.calibration.camera(CAMERA), run.config.scene
+    view = RobotView(panda(), camera)
+    return [robot.hides(view, camera, toss, time_ns, settings.robot_margin_px, settings.held_m) for toss, time_ns in at]
 
 
 def object_masks(run: Run, toss: int, scene: Done) -> Done:
     """Stage `segment`: the object's mask in every frame of one toss."""
     name = f"toss_{toss:02d}"
-    inputs = {"scene": scene.key, name: run.keys[name], "calibration": run.keys["calibration"]}
-    given = run.session.toss(toss).masks()
-    first = {i: given[i] for i in sorted(given)[:1]}
-    shown = None if first else _toss_with_mask(run)
+    rig = rig_stage(run, scene)
+    inputs = {"scene": scene.key, "rig": rig.key, name: run.keys[name], "calibration": run.keys["calibration"]}
+    choice = run.config.given_masks
+    given = chosen_masks(run.session.toss(toss).masks(), choice, toss == run.tosses[0])
+    shown = None if given or choice == "none" else _toss_with_mask(run)
     if shown is not None:
         inputs["example"] = run.keys[f"toss_{shown:02d}"]
 
     def compute(folder: Path) -> Counts:
-        with np.load(scene.folder / "scene.npz", allow_pickle=False) as stored:
-            learned = StaticScene(**stored)
         frames = run.session.toss(toss).rgbd(CAMERA)
-        segmenter = BackgroundSegmenter(learned, run.session.calibration.camera(CAMERA), run.config.masks)
+        learned = StaticScene.read(scene.folder)
+        found_rig = Rig.read(rig.folder)
+        drawn = _robot_frames(run, toss, found_rig)
+        segmenter = BackgroundSegmenter(learned, run.session.calibration.camera(CAMERA), run.config.masks, drawn)
         example = None if shown is None else _example(run, shown)
         progress = run.progress(f"toss {toss}: masks")
-        found = sorted(segmenter.masks(frames, first, example, None, progress), key=lambda m: m.position)
+        found = sorted(segmenter.masks(frames, given, example, None, progress), key=lambda m: m.position)
         write_masks(folder, toss, [m.mask for m in found], np.array([m.confidence for m in found]))
         empty = sum(not m.mask.any() for m in found)
-        return {"frames": len(found), "empty": empty, "given": len(first), "without_depth": len(frames.without_depth)}
+        return {
+            "frames": len(found),
+            "empty": empty,
+            "given": len(given),
+            "without_depth": len(frames.without_depth),
+            "robot": rig.counts["robot"] if drawn is None else "drawn",
+        }
 
-    return run.store.run("segment", 1, run.config.masks, inputs, compute)
+    config = {"given_masks": choice, "background": asdict(run.config.masks)}
+    return run.store.run("segment", 2, config, inputs, compute)
+
+
+def _robot_frames(run: Run, toss: int, rig: Rig) -> RobotFrames | None:
+    """The robot in the frames of a toss; None where it is not known."""
+    path = RobotOfSession(run.session).path(toss)
+    if rig.camera_from_base is None or path is None:
+        return None
+    frames, camera = run.session.toss(toss).rgbd(CAMERA), run.session.calibration.camera(CAMERA)
+    scale = rig.depth_scale
+    return RobotFrames(frames, RobotView(path.robot, camera), path, rig.camera_from_base, rig.arm_delay_s, scale)
 
 
 def _toss_with_mask(run: Run) -> int | None:

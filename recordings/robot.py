@@ -19,10 +19,13 @@ from numpy import ndarray as Array
 
 from recordings.errors import BadInput
 from recordings.geometry import Transform, rotation_exp
+from recordings.records import ArmStates
 
 PANDA_DISTRIBUTION = "example-robot-data"
 PANDA_URDF = "panda_description/urdf/panda.urdf"
 PANDA_TOOL = "panda_hand_tcp"
+COVERED_NS = 50_000_000
+"""Joint states may be this far apart, and an instant this far outside of them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,6 +111,44 @@ class Robot:
             names.add(above[link].name)
             link = above[link].parent
         return names
+
+
+class ArmPath:
+    """Where a robot's links were at any time of a toss, from its recorded joint states."""
+
+    def __init__(self, robot: Robot, states: ArmStates) -> None:
+        """Raises BadInput where the joints are not this robot's, or there is no state."""
+        names = tuple(j.name for j in robot.arm_joints)
+        if states.joint_names != names or len(states.time_ns) == 0:
+            raise BadInput(
+                f"{len(states.time_ns)} joint states of {', '.join(states.joint_names) or 'no joints'}; "
+                f"wanted {', '.join(names)}"
+            )
+        self.robot, self._states = robot, states
+
+    def covers(self, time_ns: int) -> bool:
+        """Whether the joints are known at a time: a state lies near on either side of it, or very near on one."""
+        times = self._states.time_ns
+        right = int(np.searchsorted(times, time_ns))
+        before = time_ns - times[right - 1] if right > 0 else COVERED_NS
+        after = times[right] - time_ns if right < len(times) else COVERED_NS
+        return bool(min(before, after) < COVERED_NS / 2 and (right in (0, len(times)) or before + after < COVERED_NS))
+
+    def q_rad(self, time_ns: int) -> Float[Array, " j"]:
+        """Joint angles, linear between two states, held beyond either end."""
+        states = self._states
+        return np.array([np.interp(time_ns, states.time_ns, q) for q in states.q_rad.T])
+
+    def finger_width_m(self, time_ns: int) -> float:
+        """Distance between the finger pads; NaN where the gripper reported none near that time."""
+        width, times = self._states.finger_width_m, self._states.time_ns
+        known = np.isfinite(width)
+        return float(np.interp(time_ns, times[known], width[known])) if known.any() else float("nan")
+
+    def links(self, time_ns: int, finger_width_m: float | None = None) -> dict[str, Transform]:
+        """`<root>_from_<link>` of every link. A width that nobody knows counts as closed."""
+        width = self.finger_width_m(time_ns) if finger_width_m is None else finger_width_m
+        return self.robot.links(self.q_rad(time_ns), float(np.nan_to_num(width)))
 
 
 @cache

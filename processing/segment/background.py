@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Float32
 from numpy import ndarray as Array
 
 from processing.segment.foreground import (
@@ -26,12 +26,16 @@ from processing.segment.foreground import (
     window_around,
 )
 from processing.segment.likeness import Likeness
+from processing.segment.robot_frames import RobotFrames, robot_likeness, with_robot
 from processing.segment.segmenter import Example, FrameMask
 from processing.segment.static_scene import StaticScene, surroundings, with_object_removed
 from recordings.errors import BadInput
 from recordings.geometry import CameraModel
 from recordings.progress import Progress
 from recordings.records import RgbdFrame
+
+OBJECT_LIKE = 0.7
+"""Log-odds of the object's colours against the robot's from which a pixel is not certainly the robot."""
 
 
 @dataclass(frozen=True)
@@ -43,10 +47,16 @@ class BackgroundSettings:
     """A smaller thing is not the object."""
     grown: float = 1.4
     """A component larger than the expected mask by this factor holds something else as well."""
+    alike: float = 0.6
+    """Share of the pixels that have grown on the object which must have its colours to be taken as its own."""
     depth_margin_m: float = 0.04
     """The object's depth in a frame exceeds the last frame's range by no more than this, when others touch it."""
     sure: float = 0.7
     """Colours are learned from masks that are more confident than this."""
+    piece_px: int = 25
+    """A smaller piece behind a finger is not looked for."""
+    piece_reach_px: int = 8
+    """How far outside of the object's hull such a piece may lie."""
     part_of_scene: float = 0.9
     """An object less of which stands out from the scene than this was partly learned as scene."""
     unknown: float = 0.02
@@ -64,15 +74,32 @@ class _Memory:
     missed: int = 0
 
 
+@dataclass(frozen=True, eq=False)
+class _Beside:
+    """What the robot's drawing adds: log-odds of the object's colours against the robot's, and where the scene is
+    unknown though no robot stands there."""
+
+    odds: Float32[Array, "h w"]
+    unknown: Bool[Array, "h w"]
+
+
 class BackgroundSegmenter:
     """Segmenter for a camera that stands still. See `Segmenter`."""
 
     name = "background"
 
-    def __init__(self, scene: StaticScene, camera: CameraModel | None, settings: BackgroundSettings) -> None:
+    def __init__(
+        self,
+        scene: StaticScene,
+        camera: CameraModel | None,
+        settings: BackgroundSettings,
+        drawn: RobotFrames | None = None,
+    ) -> None:
+        """`drawn`: the robot in every frame of the toss, where it is known; it says more than its pixels alone."""
         self._scene = scene
         self._camera = camera
         self._settings = settings
+        self._drawn = drawn
 
     def masks(
         self,
@@ -98,11 +125,28 @@ class BackgroundSegmenter:
             for i in order:
                 block = None if robot is None else robot[i]
                 frame = frames[i]
-                mask, confidence = (given[i], 1.0) if i in given else _follow(frame, scene, memory, block, s)
+                if i in given:
+                    mask, confidence = given[i], 1.0
+                else:
+                    mask, confidence = self._followed(frame, i, scene, memory, block)
                 memory = _remember(memory, frame, mask, learn=confidence > s.sure)
                 done += 1
                 progress.step(done, len(frames), "masks")
                 yield FrameMask(i, mask, confidence)
+
+    def _followed(
+        self, frame: RgbdFrame, i: int, scene: StaticScene, memory: _Memory, block: Bool[Array, "h w"] | None
+    ) -> tuple[Bool[Array, "h w"], float]:
+        seen = None if self._drawn is None else self._drawn.seen(frame, i)
+        if self._drawn is None or seen is None:
+            return _follow(frame, scene, memory, block, None, self._settings)
+        s = self._drawn.settings
+        odds = robot_likeness(frame, seen, memory.likeness, self._drawn.shares, s)
+        unknown = ~scene.known & (seen.at_color_m == 0)
+        certain = seen.certain & (odds < OBJECT_LIKE)
+        certain = certain if block is None else certain | block
+        beside = _Beside(odds, unknown)
+        return _follow(frame, with_robot(scene, frame, seen, s), memory, certain, beside, self._settings)
 
     def _scene_without(self, frame: RgbdFrame, mask: Bool[Array, "h w"]) -> StaticScene:
         moved = moved_pixels(frame, self._scene, self._settings.foreground)
@@ -191,7 +235,12 @@ def _center(mask: Bool[Array, "h w"]) -> Float[Array, "2"]:
 
 
 def _follow(
-    frame: RgbdFrame, scene: StaticScene, memory: _Memory, block: Bool[Array, "h w"] | None, s: BackgroundSettings
+    frame: RgbdFrame,
+    scene: StaticScene,
+    memory: _Memory,
+    block: Bool[Array, "h w"] | None,
+    beside: _Beside | None,
+    s: BackgroundSettings,
 ) -> tuple[Bool[Array, "h w"], float]:
     """The mask in the next frame and how sure it is; empty with 0 where the object is not found."""
     shift = memory.velocity_px * (memory.missed + 1)
@@ -205,17 +254,22 @@ def _follow(
     if block is not None:
         moved &= ~block
     rough = _component_in(moved, near)
+    if beside is not None:
+        rough |= _other_pieces(frame, moved & ~rough, expected, beside, memory, s)
     if rough.sum() < s.least_px:
         return np.zeros_like(rough), 0.0
     wide = cv2.dilate(rough.astype(np.uint8), kernel(5)) > 0
-    strange = (wide & ~scene.known).sum() > s.unknown * rough.sum()
-    if strange or rough.sum() > s.grown * area:
-        rough = _among_others(frame, scene, moved, expected, memory, s)
+    strange = (wide & (~scene.known if beside is None else beside.unknown)).sum() > s.unknown * rough.sum()
+    grown = rough.sum() > s.grown * area
+    if strange or (grown and not _is_all_object(frame, rough, expected, memory, s)):
+        rough = _among_others(frame, scene, moved, expected, memory, beside, s)
         if rough.sum() < s.least_px:
             return np.zeros_like(rough), 0.0
         mask, sure = rough, 0.6
     else:
-        mask, sure = refine_border(frame, scene, rough, None, s.foreground)
+        least = None if beside is None else s.piece_px
+        odds = None if beside is None else beside.odds
+        mask, sure = refine_border(frame, scene, rough, odds, s.foreground, least)
     if block is not None:
         mask = mask & ~block
     ratio = min(mask.sum(), area) / max(mask.sum(), area, 1)
@@ -235,12 +289,61 @@ def _component_in(mask: Bool[Array, "h w"], region: Bool[Array, "h w"]) -> Bool[
     return labels == int(inside.argmax()) if inside.any() else np.zeros_like(mask)
 
 
+def _is_all_object(
+    frame: RgbdFrame,
+    rough: Bool[Array, "h w"],
+    expected: Bool[Array, "h w"],
+    memory: _Memory,
+    s: BackgroundSettings,
+) -> bool:
+    """Whether what has grown on the object has its colours and its depth: a box that turns its broad side."""
+    added = rough & ~expected
+    if rough.sum() > s.grown**3 * memory.mask.sum():
+        return False
+    low, high = memory.depth_range_m
+    depth = frame.depth_m[added & (frame.depth_m > 0)]
+    inside = (depth > low - s.depth_margin_m) & (depth < high + s.depth_margin_m)
+    alike = memory.likeness.log_odds(frame.color_rgb, crowded=True)[added]
+    return bool(len(depth) > 0 and inside.mean() > 0.9 and (alike > 0).mean() > s.alike)
+
+
+def _other_pieces(
+    frame: RgbdFrame,
+    moved: Bool[Array, "h w"],
+    expected: Bool[Array, "h w"],
+    beside: _Beside,
+    memory: _Memory,
+    s: BackgroundSettings,
+) -> Bool[Array, "h w"]:
+    """What a finger has cut off the object: pieces of its colours and depth beside the robot, where it is expected."""
+    out = np.zeros_like(expected)
+    corners = cv2.findNonZero(expected.astype(np.uint8))
+    if corners is None:
+        return out
+    hull = cv2.fillConvexPoly(np.zeros(expected.shape, np.uint8), cv2.convexHull(corners), 1)
+    whole = cv2.dilate(hull, kernel(s.piece_reach_px)) > 0
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(moved.astype(np.uint8), connectivity=4)
+    low, high = memory.depth_range_m
+    for k in range(1, count):
+        if stats[k, cv2.CC_STAT_AREA] < s.piece_px:
+            continue
+        piece = np.asarray(labels == k)
+        depth = frame.depth_m[piece & (frame.depth_m > 0)]
+        inside = len(depth) > 0 and low - s.depth_margin_m < float(np.median(depth)) < high + s.depth_margin_m
+        close = beside.odds[piece] != 0
+        alike = close.any() and float(beside.odds[piece][close].mean()) > 0
+        if inside and alike and whole[piece].mean() > 0.6:
+            out |= piece
+    return out
+
+
 def _among_others(
     frame: RgbdFrame,
     scene: StaticScene,
     moved: Bool[Array, "h w"],
     expected: Bool[Array, "h w"],
     memory: _Memory,
+    beside: _Beside | None,
     s: BackgroundSettings,
 ) -> Bool[Array, "h w"]:
     """The object among other things that are not scene either: by its colours, its depth and where it is expected."""
@@ -254,6 +357,8 @@ def _among_others(
     depth, (low, high) = frame.depth_m[at], memory.depth_range_m
     elsewhere = (depth > 0) & ((depth < low - s.depth_margin_m) | (depth > high + s.depth_margin_m))
     likeness = memory.likeness.log_odds(frame.color_rgb[at], crowded=True)
+    if beside is not None:
+        likeness = np.minimum(likeness, np.where(beside.odds[at] != 0, beside.odds[at], likeness))
     odds = not_scene + s.foreground.weight_likeness * likeness + place - 4.0 * elsewhere
     odds = np.where(moved[at], odds, np.minimum(odds, -1.0)).astype(np.float32)
     belief = smooth(odds, frame.color_rgb[at].astype(np.float32), s.foreground)

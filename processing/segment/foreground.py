@@ -31,6 +31,10 @@ class ForegroundSettings:
     weight_scene_color: float = 1.5
     weight_nearer: float = 1.5
     weight_scene_depth: float = 1.5
+    middle_sigmas: float = 3.0
+    """So many standard deviations before the scene, depth speaks neither for the object nor for the scene."""
+    weight_sigma: float = 0.75
+    """How fast it turns to either side, per standard deviation."""
     weight_likeness: float = 1.5
     """Weight of the colour histograms, used where the scene's colour is unknown or other things touch the object."""
     darkest_shadow: float = 0.55
@@ -102,7 +106,10 @@ def evidence(
     least = np.maximum(s.color_step + 3 * scene.color_sigma[at], s.color_share * typical)
     sure = np.clip(np.abs(differs - least) / (0.3 * least), 0.2, 1.0)
     by_color = np.where(differs > least, s.weight_color, -s.weight_scene_color) * sure * scene.known[at]
-    by_depth = s.weight_nearer * nearer - s.weight_scene_depth * at_scene
+    sigma = np.maximum(scene.depth_sigma_m[at], 0.7 * stereo_sigma_m(scene_depth))
+    step = (scene_depth - depth) / np.maximum(sigma, 1e-4) - s.middle_sigmas
+    graded = np.clip(s.weight_sigma * step, -s.weight_scene_depth, s.weight_nearer)
+    by_depth = np.where((depth > 0) & (scene_depth > 0), graded, s.weight_nearer * nearer)
     total = by_color + by_depth
     if likeness is not None:
         total = total + s.weight_likeness * likeness
@@ -133,8 +140,12 @@ def refine_border(
     rough: Bool[Array, "h w"],
     likeness: Float32[Array, "h w"] | None,
     s: ForegroundSettings,
+    pieces_px: int | None = None,
 ) -> tuple[Bool[Array, "h w"], float]:
-    """The mask with its border drawn anew within a band around it, and how sure the band's pixels are (0..1)."""
+    """The mask with its border drawn anew within a band around it, and how sure the band's pixels are (0..1).
+
+    It is one piece, or all pieces of at least `pieces_px` pixels.
+    """
     rough = fill_holes(rough)
     at = window_around(rough, s.band_outside_px + 9)
     if at is None:
@@ -146,7 +157,8 @@ def refine_border(
     belief = smooth(odds, frame.color_rgb[at].astype(np.float32), s)
     band = np.abs(odds) < 8.0
     out = np.zeros_like(rough)
-    out[at] = fill_holes(largest_component(belief > 0))
+    kept = largest_component(belief > 0) if pieces_px is None else without_specks(belief > 0, pieces_px)
+    out[at] = fill_holes(kept)
     return out, float(np.abs(belief[band]).mean()) if band.any() else 0.0
 
 
@@ -163,6 +175,14 @@ def largest_component(mask: Bool[Array, "h w"]) -> Bool[Array, "h w"]:
     """The largest 4-connected component; empty stays empty."""
     count, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=4)
     return labels == 1 + int(stats[1:, cv2.CC_STAT_AREA].argmax()) if count > 1 else mask.copy()
+
+
+def without_specks(mask: Bool[Array, "h w"], least_px: int) -> Bool[Array, "h w"]:
+    """All 4-connected components of at least so many pixels, and the largest one in any case."""
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=4)
+    keep = stats[:, cv2.CC_STAT_AREA] >= least_px
+    keep[0] = False
+    return np.asarray(keep[labels]) if keep.any() else largest_component(mask)
 
 
 def fill_holes(mask: Bool[Array, "h w"], largest_share: float = 0.05) -> Bool[Array, "h w"]:

@@ -41,16 +41,34 @@ class Likeness:
             around=MEMORY * self.around + (1 - MEMORY) * around,
         )
 
+    @property
+    def object_shares(self) -> Float[Array, " b"]:
+        """How often each colour is seen on the object."""
+        return 0.5 * (self.first + self.recent)
+
     def log_odds(self, color_rgb: UInt8[Array, "h w 3"], crowded: bool = False) -> Float32[Array, "h w"]:
         """log(P(colour | object) / P(colour | surroundings)), within +-MOST.
 
         A colour seen on neither side speaks for none; where other things touch the object (`crowded`), it is theirs.
         """
-        inside = 0.5 * (self.first + self.recent)
+        inside = self.object_shares
         table = np.log((inside + UNSEEN) / (self.around + UNSEEN)).clip(-MOST, MOST)
         if crowded:
             table = np.where(inside + self.around < 0.1 * UNSEEN, -MOST, table)
         return cv2.blur(table.astype(np.float32)[_cells(color_rgb)], (3, 3))
+
+
+def color_shares(color_rgb: UInt8[Array, "h w 3"], mask: Bool[Array, "h w"]) -> Float[Array, " b"]:
+    """How often each colour is seen inside a mask."""
+    return _shares(_cells(color_rgb)[mask])
+
+
+def shares_log_odds(
+    color_rgb: UInt8[Array, "h w 3"], inside: Float[Array, " b"], other: Float[Array, " b"]
+) -> Float32[Array, "h w"]:
+    """log(P(colour | inside) / P(colour | other)), within +-MOST; a colour seen on neither speaks for none."""
+    table = np.log((inside + UNSEEN) / (other + UNSEEN)).clip(-MOST, MOST)
+    return cv2.blur(table.astype(np.float32)[_cells(color_rgb)], (3, 3))
 
 
 def _cells(color_rgb: UInt8[Array, "h w 3"]) -> Int[Array, "h w"]:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Bool, Float, Float32, UInt8
 from numpy import ndarray as Array
 
 from recordings.errors import BadInput
@@ -27,6 +29,12 @@ class SceneSettings:
     """A pixel whose depth agrees with the scene in fewer frames has no scene depth."""
     returns_share: float = 0.3
     """A pixel without scene depth that gave a return in more frames than this is unknown: something was often there."""
+    least_looks: int = 2
+    """A pixel that was free of the robot in fewer frames is learned as it is: the robot's base never leaves it."""
+    robot_margin_px: int = 14
+    """Around the robot as calibrated: its place may be off by some millimetres and tenths of a degree."""
+    held_m: float = 0.18
+    """What the gripper holds lies within this distance of the tool."""
     still_share: float = 0.5
     """The camera moved when the scene is known in a smaller share of the pixels."""
 
@@ -46,6 +54,17 @@ class StaticScene:
     known: Bool[Array, "h w"]
     table_depth_m: Float32[Array, "h w"]
 
+    def write(self, folder: Path) -> None:
+        """Into a stage's folder, as scene.npz."""
+        with open(folder / "scene.npz", "wb") as out:
+            np.savez(out, **vars(self))
+
+    @staticmethod
+    def read(folder: Path) -> StaticScene:
+        """From a stage's folder."""
+        with np.load(folder / "scene.npz", allow_pickle=False) as stored:
+            return StaticScene(**stored)
+
 
 def stereo_sigma_m(depth_m: Float32[Array, "*n"]) -> Float32[Array, "*n"]:
     """Noise of active stereo depth: it grows with the square of the distance (0.08 px of disparity: 2.3 mm at 1 m)."""
@@ -63,9 +82,15 @@ def sample_positions(counts: Sequence[int], wanted: int) -> list[tuple[int, int]
 
 
 def learn_scene(
-    frames: Iterable[RgbdFrame], table_depth_m: Float32[Array, "h w"] | None, settings: SceneSettings
+    frames: Iterable[RgbdFrame],
+    table_depth_m: Float32[Array, "h w"] | None,
+    settings: SceneSettings,
+    hidden: Sequence[Bool[Array, "h w"]] | None = None,
 ) -> StaticScene:
-    """Learn the scene from frames spread over the session. Raises BadInput where the camera moved between them."""
+    """Learn the scene from frames spread over the session. Raises BadInput where the camera moved between them.
+
+    `hidden`: pixels of each of these frames at which something known (the robot) may stand in front of the scene.
+    """
     colors, depths = [], []
     for frame in frames:
         colors.append(frame.color_rgb)
@@ -76,10 +101,14 @@ def learn_scene(
         raise BadInput(f"the images change their size within the session: {sorted({c.shape for c in colors})}")
     height, width = depths[0].shape
     table = np.zeros((height, width), dtype=np.float32) if table_depth_m is None else table_depth_m
-    rows = [
-        _learn_rows([c[i : i + 40] for c in colors], [d[i : i + 40] for d in depths], settings)
-        for i in range(0, height, 40)
-    ]
+    refuse_moving_camera(colors, hidden)
+    rows = []
+    for i in range(0, height, 40):
+        part = slice(i, i + 40)
+        covered = np.zeros((len(depths), len(depths[0][part]), width), dtype=bool)
+        if hidden is not None:
+            covered = np.stack([h[part] for h in hidden])
+        rows.append(_learn_rows([c[part] for c in colors], [d[part] for d in depths], covered, settings))
     depth, sigma, color, color_sigma, known = (np.concatenate(part) for part in zip(*rows))
     known = ~_without_thin_lines(~known)
     if known.mean() < settings.still_share:
@@ -91,6 +120,59 @@ def learn_scene(
     return StaticScene(depth, sigma, color, color_sigma, known, table)
 
 
+def refuse_moving_camera(colors: Sequence[UInt8[Array, "h w 3"]], hidden: Sequence[Bool[Array, "h w"]] | None) -> None:
+    """Raise BadInput where the picture as a whole shifts between frames.
+
+    Corners of one frame are followed into the others; things that move are few against a room that stands still.
+    """
+    shifts = [s for s in picture_shifts(colors, hidden) if np.isfinite(s)]
+    if not shifts or max(shifts) < MOVED_PX:
+        return
+    moved = sum(s >= MOVED_PX for s in shifts)
+    raise BadInput(
+        f"this camera seems to move: the picture as a whole shifts by up to {max(shifts):.1f} px within the session "
+        f"(more than {MOVED_PX:g} px in {moved} of {len(shifts)} frames looked at). "
+        "Masks need a camera that stands still: record from a fixed one; where it was bumped once, "
+        "process the tosses before and after it apart, `--toss I-J`"
+    )
+
+
+MOVED_PX = 1.5
+CORNERS = 250
+LEAST_CORNERS = 40
+FOLLOW: Mapping[str, Any] = {"winSize": (21, 21), "maxLevel": 3}
+
+
+def picture_shifts(colors: Sequence[UInt8[Array, "h w 3"]], hidden: Sequence[Bool[Array, "h w"]] | None) -> list[float]:
+    """How far the picture as a whole has shifted (px) from the middle frame; NaN where too little can be followed.
+
+    It is the median over the followed corners of each one's distance, so that less than half of them may be on things
+    that really move.
+    """
+    import cv2
+
+    middle = len(colors) // 2
+    grey = [cv2.cvtColor(np.ascontiguousarray(c), cv2.COLOR_RGB2GRAY) for c in colors[:: max(1, len(colors) // 16)]]
+    reference = cv2.cvtColor(np.ascontiguousarray(colors[middle]), cv2.COLOR_RGB2GRAY)
+    free = None if hidden is None else np.where(hidden[middle], 0, 255).astype(np.uint8)
+    corners = cv2.goodFeaturesToTrack(reference, CORNERS, 0.01, 6, mask=free)
+    if corners is None or len(corners) < LEAST_CORNERS:
+        return [float("nan")] * len(grey)
+    return [_shift(reference, other, corners) for other in grey]
+
+
+def _shift(reference: UInt8[Array, "h w"], other: UInt8[Array, "h w"], corners: Float32[Array, "n 1 2"]) -> float:
+    import cv2
+
+    there, found, _ = cv2.calcOpticalFlowPyrLK(reference, other, corners, corners.copy(), **FOLLOW)
+    back, again, _ = cv2.calcOpticalFlowPyrLK(other, reference, there, there.copy(), **FOLLOW)
+    followed = (np.asarray(found) > 0).ravel() & (np.asarray(again) > 0).ravel()
+    good = followed & (np.linalg.norm(np.asarray(back) - corners, axis=-1).ravel() < 0.5)
+    if good.sum() < LEAST_CORNERS:
+        return float("nan")
+    return float(np.median(np.linalg.norm(np.asarray(there) - corners, axis=-1).ravel()[good]))
+
+
 def _without_thin_lines(mask: Bool[Array, "h w"]) -> Bool[Array, "h w"]:
     """Depth flickers along edges; what was often hidden is a region."""
     import cv2
@@ -99,24 +181,27 @@ def _without_thin_lines(mask: Bool[Array, "h w"]) -> Bool[Array, "h w"]:
 
 
 def _learn_rows(
-    colors: Sequence[Array], depths: Sequence[Array], settings: SceneSettings
+    colors: Sequence[Array], depths: Sequence[Array], hidden: Bool[Array, "n h w"], settings: SceneSettings
 ) -> tuple[Array, Array, Array, Array, Array]:
-    """Scene depth, its noise, colour, its noise and whether known, for some rows."""
-    z = np.stack(depths)
+    """Scene depth, its noise, colour, its noise and whether known, for some rows, from what is not hidden."""
+    never = (~hidden).sum(0) < settings.least_looks
+    hidden = hidden & ~never  # what stands there for the whole session is a part of the scene
+    z = np.where(hidden, np.float32(0), np.stack(depths))
+    looks = np.maximum((~hidden).sum(0), 1)
     seen = z > 0
     count = seen.sum(0)
     ordered = np.sort(z, axis=0)  # zeros come first
     at = np.clip(len(z) - count + (settings.far_share * (count - 1)).astype(int), 0, len(z) - 1)
     far = np.take_along_axis(ordered, at[None], 0)[0]
     agrees = seen & (np.abs(z - far) < np.maximum(0.006, 5 * stereo_sigma_m(far)))
-    share = agrees.mean(0)
+    share = agrees.sum(0) / looks
     depth = _masked_median(z, agrees)
     sigma = 1.48 * _masked_median(np.abs(z - depth), agrees)
-    empty = agrees | (~seen & (share < settings.seen_share)[None])
+    empty = (agrees | (~seen & (share < settings.seen_share)[None])) & ~hidden
     color, color_sigma = _color_median(np.stack(colors), empty)
     valid = share >= settings.seen_share
     depth, sigma = np.where(valid, depth, 0), np.where(valid, sigma, 0)
-    known = valid | (seen.mean(0) < settings.returns_share)
+    known = valid | (seen.sum(0) / looks < settings.returns_share)
     return depth.astype(np.float32), sigma.astype(np.float32), color, color_sigma, known
 
 

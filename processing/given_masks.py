@@ -1,0 +1,32 @@
+"""Which of a session's given masks are used: `--masks`."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping
+from typing import Literal, get_args
+
+from jaxtyping import Bool
+from numpy import ndarray as Array
+
+GivenMasks = Literal["first", "first-toss", "all", "none"]
+DEFAULT_MASKS: GivenMasks = "first"
+
+
+def add_masks_argument(parser: argparse.ArgumentParser) -> None:
+    """`--masks`, for toss-process; its value goes into `Config.given_masks`."""
+    parser.add_argument(
+        "--masks",
+        choices=get_args(GivenMasks),
+        default=DEFAULT_MASKS,
+        help="given masks to use: each toss's first (default), only the first toss's, all, or none: found by depth",
+    )
+
+
+def chosen_masks(
+    given: Mapping[int, Bool[Array, "h w"]], choice: GivenMasks, first_toss: bool
+) -> dict[int, Bool[Array, "h w"]]:
+    """The given masks of one toss that are used, by position of the frame."""
+    if choice == "none" or (choice == "first-toss" and not first_toss):
+        return {}
+    return dict(given) if choice == "all" else {i: given[i] for i in sorted(given)[:1]}
