@@ -4,22 +4,26 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from processing.given_masks import add_masks_argument
 from processing.variants import CONTACT_ONLY, DEFAULT, NAMES, TRACKERS, rows_of
 from recordings.console import Outcome, Parser, command_parser, progress_for, run_command
 from recordings.errors import BadInput, TosslabError
 
 if TYPE_CHECKING:
     from processing.config import Config
+    from processing.pipeline import Run
     from recordings.session import Session
 
 SAMPLE = "sample"
 SAMPLE_FOLDER = Path("samples") / "box_toss"
 CONTACT = "processing.contact.command"
 BASELINE_ROW = "bundlesdf-1"
+MODEL_ORDER = ("ours", "converged", "joint", "no-cycle", "no-contact", "no-icp", "bundlesdf-10", "contact-only")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -46,8 +50,13 @@ def _parser() -> Parser:
     )
     parser.add_argument("--truth", metavar="DIR", type=Path, help="truth/ or a *_truth folder, opened for scores only")
     parser.add_argument("--model", metavar="RESULTS", type=Path, help="track with a shape that was learned before")
+    parser.add_argument("--start", choices=("truth",), help="truth: the first true pose is given (marked in the table)")
+    parser.add_argument(
+        "--table-from-depth", action="store_true", help="where the calibration lacks the table: take it from depth"
+    )
     parser.add_argument("--tracker", metavar="NAME", default=TRACKERS[0], help=f"one of: {', '.join(TRACKERS)}")
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="cpu (default) or cuda")
+    add_masks_argument(parser)
     import_module(CONTACT).add_arguments(parser)
     parser.set_defaults(work=_work)
     return parser
@@ -71,8 +80,12 @@ def _work(args: argparse.Namespace) -> Outcome:
 def _refuse_what_is_not_there(args: argparse.Namespace) -> None:
     if args.tracker not in TRACKERS:
         raise BadInput(f"there is no tracker '{args.tracker}'; available: {', '.join(TRACKERS)}")
-    if args.model is not None:
-        raise BadInput("--model needs the tracker that uses a learned shape: not there yet; run without --model")
+    if args.model is not None and args.tracker != TRACKERS[0]:
+        raise BadInput(f"--model needs --tracker {TRACKERS[0]}: {args.tracker} knows no shape")
+    if args.model is not None and args.variant is not None:
+        raise BadInput("--model RESULTS is a row of its own (with-model): leave out --variant")
+    if args.model is not None and args.start is not None:
+        raise BadInput("--start and --model exclude each other: a learned shape brings its own object frame")
     if args.device == "cuda":
         _refuse_missing_gpu()
 
@@ -121,20 +134,51 @@ def _process(args: argparse.Namespace, path: Path, name: str, several: bool) -> 
 
 
 def _vision(args: argparse.Namespace, session: Session, name: str, out: Path) -> Outcome:
-    from processing.pipeline import process, start_run
+    from processing.pipeline import process, process_with_model, start_run, with_table
 
+    model = None if args.model is None else learned_shape_of(args.model)
     tosses = chosen_tosses(args.toss, session.tosses)
     run = start_run(session, tosses, out, config_of(args), args.tracker, progress_for, args.device)
-    for variant, scope in rows_of(name, args.scope):
-        process(run, variant, scope)
+    run = _started(args, with_table(run) if args.table_from_depth else run)
+    if model is not None:
+        process_with_model(run, model)
+    else:
+        for variant, scope in rows_of(name, args.scope):
+            process(run, variant, scope)
     return _evaluate(args, session, out)  # the door to truth is opened after every track and shape is written
+
+
+def _started(args: argparse.Namespace, run: Run) -> Run:
+    """`--start truth`: the run with the first true pose of every toss."""
+    if args.start is None:
+        return run
+    from processing.truth import start_poses
+
+    starts = start_poses(args.truth, run.session, run.tosses, "d455")
+    note = "start: the first pose of every toss is the true one (--start truth)"
+    return replace(run, starts=starts, notes=(*run.notes, note))
+
+
+def learned_shape_of(results_path: Path) -> Path:
+    """The stage folder with the shape of a results folder: that of the best row that is there. Raises BadInput."""
+    from recordings.results import Results
+
+    results = Results.open(results_path)
+    there = {name: results.find(name, scope) for name, scope in results.variants() if scope == "all"}
+    for name in MODEL_ORDER:
+        if name in there and (stage := there[name].shape) is not None:
+            return results.path / stage
+    raise BadInput(
+        f"{results_path} holds no shape of all tosses together; it has {[n for n, _ in results.variants()]}: make one "
+        "by `toss-process SESSION --out RESULTS`"
+    )
 
 
 def config_of(args: argparse.Namespace) -> Config:
     """The pipeline's settings that the command line asks for; everything else stays as it is by default."""
     from processing.config import Config
 
-    return Config()
+    return Config(given_masks=args.masks)
 
 
 def _evaluate(args: argparse.Namespace, session: Session, out: Path) -> Outcome:
@@ -150,7 +194,7 @@ def _evaluate(args: argparse.Namespace, session: Session, out: Path) -> Outcome:
     scores = {}
     for variant in results.variants():
         record = results.find(*variant)
-        truth = open_truth(args.truth, session, record)
+        truth = open_truth(args.truth, session, record.calibration)
         if truth is not None:
             scores[variant] = score_variant(results, record, truth)
     rows = collect(results, scores)

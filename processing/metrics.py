@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from numpy import ndarray as Array
 
 from recordings.geometry import rotation_angle_rad
@@ -37,13 +37,24 @@ class FrameErrors:
 
     @property
     def success(self) -> Float[Array, " n"]:
-        return ((self.rotation_deg < 5) & (self.translation_m < 0.05)).astype(np.float64)
+        """1 where a frame is within 5 degrees and 5 cm."""
+        return self.within(5, 0.05)
+
+    def within(self, rotation_deg: float, translation_m: float) -> Float[Array, " n"]:
+        """1 where both errors are below the limits."""
+        return ((self.rotation_deg < rotation_deg) & (self.translation_m < translation_m)).astype(np.float64)
+
+    def only(self, chosen: Bool[Array, " n"]) -> FrameErrors:
+        """The errors of some frames."""
+        return FrameErrors(*(getattr(self, n)[chosen] for n in FIELDS))
 
     @staticmethod
     def pooled(parts: list[FrameErrors]) -> FrameErrors:
         """The frames of several tosses as one set."""
-        names = ("add_m", "adds_m", "rotation_deg", "translation_m")
-        return FrameErrors(*(np.concatenate([getattr(p, n) for p in parts]) for n in names))
+        return FrameErrors(*(np.concatenate([getattr(p, n) for p in parts]) for n in FIELDS))
+
+
+FIELDS = ("add_m", "adds_m", "rotation_deg", "translation_m")
 
 
 def align_first(estimate: Float[Array, "n 4 4"], truth: Float[Array, "n 4 4"]) -> Float[Array, "4 4"] | None:
@@ -162,3 +173,39 @@ def _kabsch(source_m: Float[Array, "n 3"], target_m: Float[Array, "n 3"]) -> Flo
     out = np.eye(4)
     out[:3, :3], out[:3, 3] = turn, b - turn @ a
     return out
+
+
+def biggest_component(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """The connected part with the largest area: what a person would keep when cleaning the mesh."""
+    parts = mesh.split(only_watertight=False)
+    return max(parts, key=lambda p: float(p.area)) if len(parts) > 1 else mesh
+
+
+def volume_error_percent(estimate: trimesh.Trimesh, truth: trimesh.Trimesh) -> float | None:
+    """Volume of the repaired estimate against the truth's, signed; None where the estimate cannot be closed."""
+    closed = repaired(estimate)
+    if closed is None or not truth.is_watertight:
+        return None
+    return float(100 * (closed.volume / truth.volume - 1))
+
+
+def repaired(mesh: trimesh.Trimesh) -> trimesh.Trimesh | None:
+    """The mesh with merged vertices, consistent winding and filled holes (trimesh); None where it stays open."""
+    import trimesh
+
+    out = trimesh.Trimesh(mesh.vertices, mesh.faces, process=True)
+    trimesh.repair.fill_holes(out)
+    trimesh.repair.fix_normals(out)
+    return out if out.is_watertight else None
+
+
+def depth_below_plane_m(
+    vertices_m: Float[Array, "v 3"],
+    world_from_object: Float[Array, "n 4 4"],
+    normal_world: Float[Array, "3"],
+    offset_m: float,
+) -> Float[Array, " n"]:
+    """How far the lowest vertex lies below the plane n . x = offset, per pose; NaN without a pose."""
+    up = np.einsum("nij,i->nj", world_from_object[:, :3, :3], normal_world)
+    lowest = (vertices_m @ up.T).min(0) + world_from_object[:, :3, 3] @ normal_world - offset_m
+    return np.asarray(np.where(np.isfinite(lowest), np.maximum(-lowest, 0.0), np.nan))

@@ -9,16 +9,27 @@ import hashlib
 import json
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from processing.config import Config
 from processing.cycle import Pass, place_stage, run_cycle
+from processing.frames import corrected_frames
 from processing.masks import object_masks, static_scene
+from processing.segment.static_scene import StaticScene
 from processing.stage import Counts, Done, Store, locked
+from processing.start_pose import StartPose
+from processing.table_plane import with_table_from_depth
 from processing.track.frame_to_model import FrameToModel
-from processing.variants import TRACKERS, Variant
-from processing.vision import CAMERA, field_stage, register_stage, track_stage
+from processing.variants import TRACKERS, WITH_MODEL, Variant
+from processing.vision import (
+    CAMERA,
+    field_stage,
+    model_stage,
+    model_track_stage,
+    register_stage,
+    track_stage,
+)
 from recordings.errors import BadInput
 from recordings.geometry import CameraModel
 from recordings.progress import Progress
@@ -49,6 +60,8 @@ class Run:
     device: str
     progress: MakeProgress
     keys: Mapping[str, str]
+    starts: Mapping[int, StartPose] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
 
     @property
     def camera(self) -> CameraModel:
@@ -56,8 +69,8 @@ class Run:
         return self.session.calibration.camera(CAMERA)
 
     def frames(self, toss: int) -> RgbdFrames:
-        """A toss's frames as vision sees them."""
-        return self.session.toss(toss).rgbd(CAMERA)
+        """A toss's frames as vision sees them, depth in true metres."""
+        return corrected_frames(self, toss)
 
 
 def start_run(
@@ -78,11 +91,24 @@ def start_run(
             f"{sorted(session.calibration.cameras) or 'no camera'}. Vision needs them"
         )
     keys = {f"toss_{t:02d}": file_sha256(session.file(t)) for t in tosses}
-    calibration = json.dumps(session.calibration.to_json(), sort_keys=True).encode()
-    keys["calibration"] = hashlib.sha256(calibration).hexdigest()
     physics = json.dumps(session.start.get("object"), sort_keys=True, default=str).encode()
-    keys["physics"] = hashlib.sha256(physics).hexdigest()
+    keys |= {"calibration": _calibration_key(session), "physics": hashlib.sha256(physics).hexdigest()}
     return Run(session, tuple(tosses), Store(results), config, tracker, device, progress, keys)
+
+
+def _calibration_key(session: Session) -> str:
+    return hashlib.sha256(json.dumps(session.calibration.to_json(), sort_keys=True).encode()).hexdigest()
+
+
+def with_table(run: Run) -> Run:
+    """The same run with the table that the depth of the empty scene shows (`--table-from-depth`)."""
+    scene = StaticScene.read(static_scene(run).folder)
+    calibration, found = with_table_from_depth(run.session.calibration, CAMERA, scene.depth_m)
+    session = run.session.with_calibration(calibration)
+    note = f"the table is from depth ({100 * found['share']:.0f} % of it, spread {1e3 * found['spread_m']:.1f} mm)"
+    told = f"{note}; gravity is taken to be its normal"
+    return replace(run, session=session, keys={**run.keys, "calibration": _calibration_key(session)},
+                   notes=(*run.notes, told))  # fmt: skip
 
 
 def process(run: Run, variant: Variant, scope: Scope) -> VariantRecord:
@@ -96,6 +122,18 @@ def process(run: Run, variant: Variant, scope: Scope) -> VariantRecord:
         first = _all_together(run, once, masks)  # P, O
         last = first if variant.refined is None else _refined_rows(run, variant, scope, once, first, masks)
     record = _record(run, variant, scope, last, masks)
+    with locked(run.store.results / ".variants.lock"):
+        write_variant(run.store.results, record)
+    return record
+
+
+def process_with_model(run: Run, model: Path) -> VariantRecord:
+    """Tosses tracked with a shape that was learned before (`--model`); nothing is learned anew."""
+    scene, shape = static_scene(run), model_stage(run, model)
+    masks = {t: object_masks(run, t, scene) for t in run.tosses}
+    tracks = {t: model_track_stage(run, t, masks[t], shape) for t in run.tosses}
+    last = Pass(tracks, dict.fromkeys(run.tosses, shape), masks, shared_frame=True, notes=(f"shape: {model.name}",))
+    record = _record(run, WITH_MODEL, "all", last, masks)
     with locked(run.store.results / ".variants.lock"):
         write_variant(run.store.results, record)
     return record
@@ -158,7 +196,7 @@ def _record(run: Run, variant: Variant, scope: Scope, last: Pass, masks: Mapping
         contact=next(iter(contact.values()), None) if scope == "all" else None,
         shared_object_frame=last.shared_frame,
         session_path=os.path.relpath(run.session.path.resolve(), run.store.results.resolve()),
-        notes=(f"tracker: {run.tracker}", *last.notes),
+        notes=(f"tracker: {run.tracker}", *run.notes, *last.notes),
         extra={"tracker": run.tracker, "contact_of_toss": contact, "passes": list(last.passes)},
     )
 
@@ -171,8 +209,7 @@ def first_pass(run: Run, toss: int, masks: Done) -> Done:
     inputs = {"masks": masks.key, name: run.keys[name], "calibration": run.keys["calibration"]}
 
     def compute(folder: Path) -> Counts:
-        frames = run.session.toss(toss).rgbd(CAMERA)
-        camera = run.session.calibration.camera(CAMERA)
+        frames, camera = run.frames(toss), run.camera
         tracker = FrameToModel(run.config.frame_to_model)
         tracked = tracker.track(
             toss, frames, read_masks(masks.folder, toss), camera, f"object_{name}", run.progress(f"toss {toss}: poses")

@@ -17,11 +17,14 @@ from processing.metrics import (
     FrameErrors,
     align_first,
     auc_percent,
+    biggest_component,
     chamfer,
     frame_errors,
     icp_align,
     surface_points,
+    volume_error_percent,
 )
+from processing.phases import PHASES, Phase, frame_phases
 from processing.truth import Truth
 from recordings.errors import BadInput
 from recordings.results import Results, VariantRecord
@@ -43,11 +46,14 @@ class Value:
 
 @dataclass(frozen=True, eq=False)
 class TossScore:
-    """Scores of one toss, aligned at its own first frame."""
+    """Scores of one toss, aligned at its own first frame: `errors`, `phase` and `time_s` (since the first frame) of
+    every frame that has a true pose. `phase` is empty where the world is not known."""
 
     toss: int
     errors: FrameErrors
     lost: int
+    time_s: Float[Array, " n"]
+    phase: tuple[Phase, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +63,7 @@ class VariantScore:
     values: dict[str, Value]
     tosses: tuple[TossScore, ...]
     warnings: tuple[str, ...] = field(default=())
+    phases: dict[str, dict[str, Value]] = field(default_factory=dict)
 
 
 def score_variant(results: Results, record: VariantRecord, truth: Truth) -> VariantScore:
@@ -75,7 +82,10 @@ def score_variant(results: Results, record: VariantRecord, truth: Truth) -> Vari
             continue
         shifts[toss] = shift
         errors = frame_errors(track.camera_from_object @ shift, true, points)
-        tosses.append(TossScore(toss, errors, int(track.lost.sum())))
+        known = np.isfinite(true[:, 0, 0])
+        phase = tuple(p for p, k in zip(_phases(record, track, true, mesh), known) if k)
+        time_s = 1e-9 * (track.time_ns[known] - track.time_ns[0])
+        tosses.append(TossScore(toss, errors, int(track.lost.sum()), time_s, phase))
     if not tosses:
         return VariantScore({}, (), tuple(warnings))
     values = pose_values(FrameErrors.pooled([t.errors for t in tosses]), "each toss at its own first frame")
@@ -84,7 +94,40 @@ def score_variant(results: Results, record: VariantRecord, truth: Truth) -> Vari
     if record.shared_object_frame:
         values |= _with_one_alignment(tracks, truth, points, shifts[min(shifts)])
     values |= shape_values(results, record, shifts, mesh)
-    return VariantScore(values, tuple(tosses), tuple(warnings))
+    values |= contact_values(results, record, truth)
+    return VariantScore(values, tuple(tosses), tuple(warnings), phase_values(tosses))
+
+
+def _phases(
+    record: VariantRecord, track: ObjectTrack, true: Float[Array, "n 4 4"], mesh: trimesh.Trimesh
+) -> list[Phase]:
+    """By the true motion in the world; nothing where the calibration does not know the world."""
+    world = record.calibration.find("world", track.camera)
+    if world is None:
+        return []
+    return frame_phases(track.time_ns, world.matrix @ true, np.asarray(mesh.center_mass))
+
+
+def phase_values(tosses: list[TossScore]) -> dict[str, dict[str, Value]]:
+    """Pose scores of each phase's frames, aligned as all frames are."""
+    if not any(t.phase for t in tosses):
+        return {}
+    every = FrameErrors.pooled([t.errors for t in tosses])
+    labels = np.array([p for t in tosses for p in (t.phase or ["held"] * len(t.errors.add_m))])
+    aligned = "each toss at its own first frame"
+    return {p: pose_values(every.only(labels == p), aligned) for p in PHASES if (labels == p).any()}
+
+
+def contact_values(results: Results, record: VariantRecord, truth: Truth) -> dict[str, Value]:
+    """Friction, and its error where the truth knows it."""
+    model = results.contact(record.name, record.scope)
+    if model is None:
+        return {}
+    n = len(record.tosses)
+    values = {"friction": Value(model.friction, "", n, "nothing")}
+    if truth.friction is not None:
+        values["friction_error"] = Value(model.friction - truth.friction, "", n, "nothing")
+    return values
 
 
 def pose_values(e: FrameErrors, aligned: str, prefix: str = "") -> dict[str, Value]:
@@ -94,6 +137,7 @@ def pose_values(e: FrameErrors, aligned: str, prefix: str = "") -> dict[str, Val
         "adds_auc": (auc_percent(e.adds_m), "%"),
         "add_auc": (auc_percent(e.add_m), "%"),
         "success_5deg_5cm": (100 * float(e.success.mean()), "%"),
+        "success_5deg_2cm": (100 * float(e.within(5, 0.02).mean()), "%"),
         "median_rotation": (_quantile(e.rotation_deg, 0.5), "deg"),
         "p90_rotation": (_quantile(e.rotation_deg, 0.9), "deg"),
         "median_translation": (1000 * _quantile(e.translation_m, 0.5), "mm"),
@@ -133,9 +177,13 @@ def shape_values(
     scored = [_chamfers(shape, shift, truth) for shape, shift in pairs if len(shape.faces)]
     if not scored:
         return {}
-    placed, fitted = [a for a, _ in scored], [b for _, b in scored]
+    placed, fitted, cleaned = ([s[k] for s in scored] for k in range(3))
     n = len(scored)
+    volumes = [v for shape, _ in pairs if (v := volume_error_percent(_mesh(shape), truth)) is not None]
+    volume = {"volume_error": Value(_mean(volumes), "%", len(volumes), "nothing")} if volumes else {}
     return {
+        **volume,
+        "cd_icp_cleaned": Value(_mean([c.cm for c in cleaned]), "cm", n, f"{where}, then rigid ICP; biggest part"),
         "cd": Value(_mean([c.cm for c in placed]), "cm", n, where),
         "cd_icp": Value(_mean([c.cm for c in fitted]), "cm", n, f"{where}, then rigid ICP"),
         "cd_icp_estimate_to_truth": Value(_mean([100 * c.estimate_to_truth_m for c in fitted]), "cm", n, "rigid ICP"),
@@ -151,15 +199,22 @@ def _first_in_frame_of(results: Results, record: VariantRecord, shifts: dict[int
     return next((t for t in sorted(shifts) if tracks[t].object_frame == frame), None)
 
 
-def _chamfers(shape: ObjectShape, shift: Float[Array, "4 4"], truth: trimesh.Trimesh) -> tuple[Chamfer, Chamfer]:
-    """Chamfer after the alignment of the poses, and after a further rigid ICP."""
-    import trimesh
-
-    mesh = trimesh.Trimesh(shape.vertices_m, shape.faces, process=False)
+def _chamfers(
+    shape: ObjectShape, shift: Float[Array, "4 4"], truth: trimesh.Trimesh
+) -> tuple[Chamfer, Chamfer, Chamfer]:
+    """Chamfer after the alignment of the poses, after a further rigid ICP, and that of the biggest part alone."""
+    mesh = _mesh(shape)
     mesh.apply_transform(np.linalg.inv(shift))
     placed = chamfer(mesh, truth)
     mesh.apply_transform(icp_align(surface_points(mesh, SURFACE_POINTS), surface_points(truth, SURFACE_POINTS)))
-    return placed, chamfer(mesh, truth)
+    fitted, biggest = chamfer(mesh, truth), biggest_component(mesh)
+    return placed, fitted, fitted if biggest is mesh else chamfer(biggest, truth)
+
+
+def _mesh(shape: ObjectShape) -> trimesh.Trimesh:
+    import trimesh
+
+    return trimesh.Trimesh(shape.vertices_m, shape.faces, process=False)
 
 
 def _mean(values: list[float]) -> float:

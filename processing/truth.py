@@ -7,6 +7,7 @@ folder of the folder layout (toss_XX/poses_camera_object.npz, mesh.obj). Nothing
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,11 +15,11 @@ import numpy as np
 from jaxtyping import Float, Int64
 from numpy import ndarray as Array
 
+from processing.start_pose import StartPose
 from recordings.errors import BadInput, DamagedFile
 from recordings.geometry import Transform
-from recordings.results import VariantRecord
 from recordings.session import Session, Toss
-from recordings.tracks import ObjectTrack, RigCalibration
+from recordings.tracks import ObjectTrack, RigCalibration, Status
 
 MEETS_S = 0.005
 """A truth pose belongs to a frame when it is this near in time."""
@@ -31,6 +32,15 @@ class Truth:
     folder: Path
     calibration: RigCalibration
     mesh_path: Path | None
+
+    @property
+    def friction(self) -> float | None:
+        """The true coefficient of friction, where the folder knows it."""
+        known = _read_document(self.folder / "physics.json") or _read_document(self.folder / "truth.json").get(
+            "physics"
+        )
+        value = known.get("friction_mu") if isinstance(known, dict) else None
+        return float(value) if isinstance(value, int | float) else None
 
     def camera_from_object(self, track: ObjectTrack) -> Float[Array, "n 4 4"] | None:
         """True poses in the frames of a track, NaN where the truth has none there; None where it has no such toss."""
@@ -64,7 +74,32 @@ class Truth:
         return Transform.from_matrix("object", "tagged", np.array(matrix, dtype=np.float64))
 
 
-def open_truth(given: Path | None, session: Session, record: VariantRecord) -> Truth | None:
+def start_poses(given: Path | None, session: Session, tosses: Sequence[int], camera: str) -> dict[int, StartPose]:
+    """`--start truth`: the first true pose of every toss, the one exception to the door's rule. Raises BadInput where
+    there is no truth, or none of a toss."""
+    truth = open_truth(given, session, session.calibration)
+    if truth is None:
+        raise BadInput(f"--start truth: {session.path} has no truth/; give one by --truth DIR")
+    found = {}
+    for toss in tosses:
+        times_ns = session.toss(toss).rgbd(camera).times_ns
+        poses = truth.camera_from_object(nowhere_track(toss, camera, times_ns))
+        known = np.flatnonzero(np.isfinite(poses[:, 0, 0])) if poses is not None else np.zeros(0, dtype=np.int64)
+        if poses is None or len(known) == 0:
+            raise BadInput(f"--start truth: {truth.folder} has no true pose in toss {toss}")
+        first = int(known[0])
+        found[toss] = StartPose(first, Transform.from_matrix(camera, "object", poses[first]))
+    return found
+
+
+def nowhere_track(toss: int, camera: str, times_ns: Int64[Array, " n"]) -> ObjectTrack:
+    """A track of these times without a pose."""
+    n = len(times_ns)
+    status: tuple[Status, ...] = tuple("lost" for _ in range(n))
+    return ObjectTrack(toss, camera, "object", times_ns, np.full((n, 4, 4), np.nan), status, np.full((n, 6, 6), np.nan))
+
+
+def open_truth(given: Path | None, session: Session, calibration: RigCalibration) -> Truth | None:
     """`--truth DIR` where it is given, else the session's own truth/, else None. Raises BadInput for a wrong DIR."""
     folder = given if given is not None else session.truth_folder
     if folder is None:
@@ -76,7 +111,7 @@ def open_truth(given: Path | None, session: Session, record: VariantRecord) -> T
             "(a *_truth folder)"
         )
     mesh = folder / "mesh.obj"
-    return Truth(folder, record.calibration, mesh if mesh.exists() else None)
+    return Truth(folder, calibration, mesh if mesh.exists() else None)
 
 
 def _folder_poses(path: Path, first_frame_ns: int) -> tuple[Int64[Array, " m"], Float[Array, "m 4 4"]]:

@@ -47,6 +47,8 @@ BEYOND = (
     Variant("joint", "ours, one joint objective", "all_tosses", "joint", True, True),
 )
 """Variants beyond the paper's table, in scope all."""
+WITH_MODEL = Variant("with-model", "tracked with a shape learned before", "all_tosses")
+"""What `--model` makes; it is not asked for by its name."""
 ROWS = (*TABLE, *BEYOND)
 CONTACT_ONLY = "contact-only"
 """Contact learning on poses that were recorded or imported, without vision."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,12 +13,11 @@ from processing.stage import Counts, Done
 from processing.track.multi_hypothesis import read_toss_track, write_toss_track
 from processing.track.register import register_tosses
 from processing.track.sequence import track_toss
-from recordings.results import read_masks, read_track, write_shape, write_track
+from recordings.results import read_masks, read_shape, read_track, write_shape, write_track
+from recordings.session_writer import file_sha256
 from recordings.tracks import ObjectTrack, Status
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from processing.pipeline import Run
 
 CAMERA = "d455"
@@ -27,20 +27,62 @@ def track_stage(run: Run, toss: int, masks: Done) -> Done:
     """Stage `track`: p_i, the poses of one toss from that toss alone."""
     name = f"toss_{toss:02d}"
     inputs = {"masks": masks.key, name: run.keys[name], "calibration": run.keys["calibration"]}
+    start = run.starts.get(toss)
+    if start is not None:
+        inputs["start"] = start.digest
 
     def compute(folder: Path) -> Counts:
-        frames = run.session.toss(toss).rgbd(CAMERA)
+        frames = run.frames(toss)
         seen = read_masks(masks.folder, toss)
         tracked = track_toss(
             frames,
             seen,
-            run.session.calibration.camera(CAMERA),
+            run.camera,
             run.config.track,
             run.progress(f"toss {toss}: poses"),
             toss=toss,
-            object_frame=f"object_{name}",
+            object_frame=f"object_{name}" if start is None else "object",
             confidence=seen.confidence,
             world_from_camera=run.session.calibration.find("world", CAMERA),
+            start=None if start is None else start.camera_from_object,
+            start_frame=None if start is None else start.frame,
+        )
+        write_toss_track(folder, tracked)
+        return _count(tracked.track)
+
+    return run.store.run("track", 2, run.config.track, inputs, compute)
+
+
+def model_stage(run: Run, model: Path) -> Done:
+    """Stage `model`: a shape that was learned before, brought into this results folder."""
+    shape = read_shape(model)
+    inputs = {"shape": file_sha256(model / "shape.ply")}
+
+    def compute(folder: Path) -> Counts:
+        write_shape(folder, shape)
+        return {"from": model.name, "vertices": len(shape.vertices_m)}
+
+    return run.store.run("model", 1, {}, inputs, compute)
+
+
+def model_track_stage(run: Run, toss: int, masks: Done, model: Done) -> Done:
+    """Stage `track` against a learned shape, in that shape's object frame."""
+    name = f"toss_{toss:02d}"
+    inputs = {"masks": masks.key, name: run.keys[name], "calibration": run.keys["calibration"], "model": model.key}
+
+    def compute(folder: Path) -> Counts:
+        seen, shape = read_masks(masks.folder, toss), read_shape(model.folder)
+        tracked = track_toss(
+            run.frames(toss),
+            seen,
+            run.camera,
+            run.config.track,
+            run.progress(f"toss {toss}: poses with the learned shape"),
+            toss=toss,
+            object_frame=shape.object_frame,
+            confidence=seen.confidence,
+            world_from_camera=run.session.calibration.find("world", CAMERA),
+            model=shape,
         )
         write_toss_track(folder, tracked)
         return _count(tracked.track)
@@ -56,17 +98,18 @@ def register_stage(run: Run, tracks: dict[int, Done], masks: dict[int, Done]) ->
     inputs = {f"track_{t:02d}": tracks[t].key for t in run.tosses}
 
     def compute(folder: Path) -> Counts:
-        camera = run.session.calibration.camera(CAMERA)
+        camera = run.camera
         world = run.session.calibration.find("world", CAMERA)
         tosses = []
         for toss in run.tosses:
-            frames, seen = run.session.toss(toss).rgbd(CAMERA), read_masks(masks[toss].folder, toss)
+            frames, seen = run.frames(toss), read_masks(masks[toss].folder, toss)
             tosses.append(
                 read_toss_track(
                     tracks[toss].folder, toss, frames, seen, camera, seen.confidence, run.config.track, world
                 )
             )
-        together = register_tosses(tosses, run.config.register, run.progress("one object frame"))
+        progress = run.progress("one object frame")
+        together = register_tosses(tosses, run.config.register, progress, together=bool(run.starts))
         counts = {"not_joined": [t for t, joined in zip(run.tosses, together.joined, strict=True) if not joined]}
         for track, joined in zip(together.tracks, together.joined, strict=True):
             write_track(folder, replace(track if joined else lost_track(track), object_frame="object"))
@@ -85,10 +128,10 @@ def field_stage(run: Run, name: str, tracks: dict[int, Done], masks: dict[int, D
     def compute(folder: Path) -> Counts:
         views = []
         for toss, track in tracks.items():
-            frames = run.session.toss(toss).rgbd(CAMERA)
+            frames = run.frames(toss)
             seen = read_masks(masks[toss].folder, toss)
             views.append(TossViews(frames, frames.depth_times_ns, seen, read_track(track.folder, toss)))
-        camera = run.session.calibration.camera(CAMERA)
+        camera = run.camera
         shape, used = learn_shape(views, camera, config, run.device, run.progress(f"{name}: shape"))
         write_shape(folder, shape)
         unseen = 0.0 if shape.observed is None else float((~shape.observed).mean())

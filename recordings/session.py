@@ -284,6 +284,12 @@ class Session:
             raise BadInput(f"{path} does not exist; wanted a session folder or an .mcap file")
         return _open_folder(path) if path.is_dir() else _open_file(path)
 
+    def with_calibration(self, calibration: RigCalibration) -> Session:
+        """The same session seen with another calibration; nothing on disk changes."""
+        other = Session(self.path, {"start": self.start, "stop": self.stop}, calibration, self._files)
+        other._open = self._open
+        return other
+
     @property
     def name(self) -> str:
         return str(self.start.get("name") or self.path.resolve().name.removesuffix(".mcap"))
