@@ -14,7 +14,7 @@ from importlib import metadata
 from typing import Any, Self
 
 from acquisition.devices import DeviceLost, DeviceRefused, GripperCommand, GripperSample, Health
-from acquisition.drivers.franka import not_opened
+from acquisition.drivers.franka import not_opened, refuse_serial
 from acquisition.drivers.franka_hand_worker import SAMPLE
 from acquisition.drivers.inbox import Inbox
 from acquisition.drivers.worker import Worker
@@ -57,11 +57,7 @@ class FrankaHand:
 
     def open(self) -> None:
         """Connect. Raises DeviceNotFound where nothing answers."""
-        if self._serial is not None:
-            raise DeviceRefused(
-                f"{self.name}: found serial '{self._serial}' in the rig, but the hand tells no serial number; "
-                "identify it by `host` and remove `serial`"
-            )
+        refuse_serial(self.name, self._serial)
         self.close()
         self._clean()
         self._inbox = Inbox(BUFFER)

@@ -6,7 +6,6 @@ between two states, in the callback.
 
 from __future__ import annotations
 
-import struct
 import sys
 import time
 from typing import Any
@@ -15,15 +14,15 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray as Array
 
+from acquisition.drivers.arm_rows import row
+from acquisition.drivers.path import Brake, along, from_here
 from acquisition.drivers.worker import WorkerEnd
 
 JOINTS = 7
-STATE = struct.Struct("<Qq36dB")
-"""Arm time in ms, host time in ns, q, dq, q_d, dq_d, tau_J, share of commands in time, robot mode."""
+RATE_HZ = 1000.0
+STATE = row(JOINTS)
 BATCH = 10
 LOOK_EVERY = 5
-BRAKE_S = 0.7
-BLEND_S = 0.3
 NO_FILTER_HZ = 1000.0
 """libfranka's low-pass filter is off from here on: it would delay the toss by its phase."""
 
@@ -67,11 +66,12 @@ class ArmLoop:
         return self._ticks % LOOK_EVERY != 0 or not self._end.waiting()
 
     def _log(self, state: Any) -> None:
-        mode = state.robot_mode.value
+        mode, time_ms = state.robot_mode.value, state.time.to_msec()
         STATE.pack_into(
             self._batch,
             self._filled * STATE.size,
-            state.time.to_msec(),
+            time_ms,
+            time_ms * 1_000_000,
             time.monotonic_ns(),
             *state.q,
             *state.dq,
@@ -102,8 +102,7 @@ class Follower:
         self._calls = 0
         self._missed = 0
         self._quit = False
-        self._brake: tuple[float, float] | None = None
-        """Where on the path (ms), and how long ago (s), braking began."""
+        self._brake: Brake | None = None
 
     def run(self) -> bool:
         """Move, and tell how it went; false when the driver asked to quit meanwhile."""
@@ -129,9 +128,7 @@ class Follower:
 
     def _prepare(self, q_desired: Float[Array, "7"]) -> None:
         """The path from where the arm's controller stands (encoder noise apart from the planned start), as commands."""
-        share = np.clip(np.arange(len(self._path)) / (1000 * BLEND_S), 0, 1)
-        left = 1 - share**3 * (10 - 15 * share + 6 * share**2)
-        self._path = self._path + left[:, None] * (q_desired - self._path[0])
+        self._path = from_here(self._path, q_desired, RATE_HZ)
         self._commands = [self._lib.JointPositions(q) for q in self._path.tolist()]
         self._commands[-1].motion_finished = True
 
@@ -149,31 +146,15 @@ class Follower:
     def _look(self, elapsed_ms: int) -> None:
         for message, _ in self._end.commands():
             if message["do"] in ("halt", "quit"):
-                self._brake = (float(self._at_ms - elapsed_ms), 0.0)
+                self._brake = self._brake or Brake(float(self._at_ms - elapsed_ms), RATE_HZ)
             self._quit |= message["do"] == "quit"
 
     def _braking(self, elapsed_ms: int) -> Any:
-        """Go on along the path, ever slower: its speed is scaled by a smooth step from 1 to 0 within BRAKE_S."""
         assert self._brake is not None
-        place, since_s = self._brake
-        for _ in range(max(1, elapsed_ms)):
-            share = min(since_s / BRAKE_S, 1.0)
-            place += 1 - share**3 * (10 - 15 * share + 6 * share**2)
-            since_s += 1e-3
-        self._brake = (place, since_s)
-        command = self._lib.JointPositions(_along(self._path, place).tolist())
-        command.motion_finished = since_s > BRAKE_S + 0.005
+        self._brake.advance(elapsed_ms)
+        command = self._lib.JointPositions(along(self._path, self._brake.place).tolist())
+        command.motion_finished = self._brake.standing
         return command
-
-
-def _along(path: Float[Array, "n 7"], place: float) -> Float[Array, "7"]:
-    """The path at a fractional sample, by Catmull-Rom interpolation; beyond its end: the end."""
-    last = len(path) - 1
-    i = min(int(place), last)
-    u = min(place, float(last)) - i
-    p0, p1, p2, p3 = (path[min(max(i + k, 0), last)] for k in (-1, 0, 1, 2))
-    m1, m2 = (p2 - p0) / 2, (p3 - p1) / 2
-    return (2 * u**3 - 3 * u**2 + 1) * p1 + (u**3 - 2 * u**2 + u) * m1 + (3 * u**2 - 2 * u**3) * p2 + (u**3 - u**2) * m2
 
 
 def _reason(state: Any) -> str:

@@ -50,7 +50,7 @@ def find_serial(rs: Any, context: Any, name: str, serial: str | None) -> str:
         return str(next(iter(found)))
     if serial is None and found:
         raise DeviceNotFound(f"{name}: found {seen}; wanted one: name its `serial` in the rig")
-    if serial not in found:
+    if serial is None or serial not in found:
         wanted = f"serial {serial}" if serial else "a camera"
         raise DeviceNotFound(
             f"{name}: found {seen}; wanted {wanted}; check the cable (USB 3) and, where the camera is plugged in, the "
