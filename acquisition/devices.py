@@ -21,7 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal, Protocol, Self, runtime_checkable
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, Int64, UInt8, UInt16
@@ -223,7 +223,7 @@ class Device(Protocol):
     def start(self) -> None: ...
     def stop(self) -> None: ...
     def close(self) -> None: ...
-    def __enter__(self) -> Self:
+    def __enter__(self) -> Any:
         """open()"""
 
     def __exit__(self, *exc: object) -> None:
