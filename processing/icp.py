@@ -25,8 +25,10 @@ Verdict = Literal["aligned", "too few points", "poor fit", "moved too far", "los
 class IcpConfig:
     iterations: int = 12
     """Gauss-Newton steps, each with new matches."""
-    most_points: int = 3000
+    most_points: int = 1200
     """Raw depth points used of a frame, drawn evenly."""
+    border_px: int = 2
+    """Depth this near to the mask's outline is fattened or flies: left out."""
     fewest_points: int = 150
     """Below this a frame is rejected: too few points."""
     reach_m: float = 0.015
@@ -40,7 +42,7 @@ class IcpConfig:
     """A direction whose eigenvalue is below this share of the best-constrained one's is not observable."""
     least_noise_m: float = 0.0008
     """Depth is never trusted more than this, however well the shape fits."""
-    points_per_measurement: float = 25.0
+    points_per_measurement: float = 100.0
     """Depth errors are alike over a patch of pixels: so many points weigh as one independent measurement."""
 
 
@@ -124,11 +126,15 @@ def align_frames(
     covariance: Float[Array, "n 6 6"] | None = None,
 ) -> list[Alignment]:
     """`align_frame` on every frame of a toss; raw depth inside the raw mask is what the shape is laid on."""
+    import cv2
+
     surface = ShapeSurface(shape)
     rays = camera.pixel_rays()
+    kernel = np.ones((2 * config.border_px + 1,) * 2, np.uint8)
     out = []
     for i, (depth_m, mask, pose) in enumerate(zip(depths_m, masks, camera_from_object, strict=True)):
-        v, u = np.nonzero(mask & (depth_m > 0))
+        inside = cv2.erode(mask.astype(np.uint8), kernel).astype(bool)
+        v, u = np.nonzero(inside & (depth_m > 0))
         every = max(1, len(v) // config.most_points)
         v, u = v[::every], u[::every]
         points = rays[v, u] * depth_m[v, u, None].astype(np.float64)

@@ -38,7 +38,7 @@ class FrameErrors:
     @property
     def success(self) -> Float[Array, " n"]:
         """1 where a frame is within 5 degrees and 5 cm."""
-        return self.within(5, 0.05)
+        return self.within(5.0, 0.05)
 
     def within(self, rotation_deg: float, translation_m: float) -> Float[Array, " n"]:
         """1 where both errors are below the limits."""

@@ -137,7 +137,7 @@ def pose_values(e: FrameErrors, aligned: str, prefix: str = "") -> dict[str, Val
         "adds_auc": (auc_percent(e.adds_m), "%"),
         "add_auc": (auc_percent(e.add_m), "%"),
         "success_5deg_5cm": (100 * float(e.success.mean()), "%"),
-        "success_5deg_2cm": (100 * float(e.within(5, 0.02).mean()), "%"),
+        "success_5deg_2cm": (100 * float(e.within(5.0, 0.02).mean()), "%"),
         "median_rotation": (_quantile(e.rotation_deg, 0.5), "deg"),
         "p90_rotation": (_quantile(e.rotation_deg, 0.9), "deg"),
         "median_translation": (1000 * _quantile(e.translation_m, 0.5), "mm"),

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from processing.pipeline import Run
 
 
-Start = Literal["anew", "poses"]
+Start = Literal["anew", "poses", "shape"]
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class CycleConfig:
     renderer: RendererName = "raycast"
     start: Start = "poses"
     """`anew` (the paper): the second pass is given the first pose only. `poses`: the poses at which the shape was drawn
-    are refined, only lost frames are sought."""
+    are refined, only lost frames are sought. `shape`: the same, and the shape's own surface and colours take part."""
     worse_share: float = 0.005
     most_passes: int = 4
     same_rotation_deg: float = 0.05
@@ -126,7 +126,7 @@ def second_tracks(run: Run, name: str, drawn: Done, shape: Done, masks: Mapping[
     """Poses from (RGB, D'', M''): every toss anew from its first pose, then all of them refined together."""
     tracks = {t: _second_track(run, t, drawn, shape, masks[t]) for t in masks}
     seen = {t: d for t, d in tracks.items() if d.counts["frames"] > d.counts["lost"]}
-    if len(seen) < 2:
+    if len(seen) < 2 or run.config.cycle.start == "shape":  # the shape holds them together
         return tracks
     inputs = {"drawn": drawn.key, "shape": shape.key, **{f"track_{t:02d}": d.key for t, d in tracks.items()}}
 
@@ -153,7 +153,8 @@ def _second_track(run: Run, toss: int, drawn: Done, shape: Done, masks: Done) ->
 
     def compute(folder: Path) -> Counts:
         before = read_track(drawn.folder, toss)
-        frames = second_frames(run, toss, before, read_shape(shape.folder), masks)
+        body = read_shape(shape.folder)
+        frames = second_frames(run, toss, before, body, masks)
         known = np.flatnonzero(np.isfinite(before.camera_from_object[:, 0, 0]))
         if len(known) == 0:
             write_track(folder, before)
@@ -162,6 +163,8 @@ def _second_track(run: Run, toss: int, drawn: Done, shape: Done, masks: Done) ->
         if run.config.cycle.start == "anew":
             start = Transform.from_matrix(CAMERA, before.object_frame, before.camera_from_object[known[0]])
             given = {"start": start, "start_frame": int(known[0])}
+        if run.config.cycle.start == "shape":
+            given["model"] = body
         tracked = track_toss(
             frames,
             frames.masks,
