@@ -14,7 +14,7 @@ import time
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, Literal
 
 import numpy as np
 
@@ -67,7 +67,7 @@ class D455Camera:
         self._about: dict[str, Any] = {}
         self._unit_m = 0.001
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> D455Camera:
         self.open()
         return self
 

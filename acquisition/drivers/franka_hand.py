@@ -11,7 +11,7 @@ import json
 import threading
 from dataclasses import replace
 from importlib import metadata
-from typing import Any, Self
+from typing import Any
 
 from acquisition.devices import DeviceLost, DeviceRefused, GripperCommand, GripperSample, Health
 from acquisition.drivers.franka import not_opened, refuse_serial
@@ -47,7 +47,7 @@ class FrankaHand:
         self._period_ns: int | None = None
         self._received = self._dropped = 0
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> FrankaHand:
         self.open()
         return self
 

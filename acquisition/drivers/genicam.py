@@ -14,7 +14,7 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from jaxtyping import UInt8
@@ -83,7 +83,7 @@ class GenicamCamera:
         self._leaving: threading.Thread | None = None
         self._counts: tuple[dict[str, int], dict[str, int]] = ({}, {})
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> GenicamCamera:
         self.open()
         return self
 

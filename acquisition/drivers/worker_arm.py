@@ -6,7 +6,7 @@ import json
 import threading
 import time
 from dataclasses import replace
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
@@ -53,7 +53,7 @@ class WorkerArm:
         self._q_desired: np.ndarray | None = None
         self._received = self._dropped = 0
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> WorkerArm:
         self.open()
         return self
 

@@ -13,13 +13,14 @@ import importlib
 import json
 import subprocess
 import sys
-from typing import Any, Protocol, Self
+from typing import Any, Protocol, runtime_checkable
 
 from recordings.errors import TosslabError
 
 SIMULATORS = {"fci": "acquisition.simulators.fci:FciServer", "rtde": "acquisition.simulators.rtde:UrServer"}
 
 
+@runtime_checkable
 class Simulator(Protocol):
     """What every simulator here offers."""
 
@@ -41,7 +42,7 @@ class Apart:
         self._child = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
         self._answer()
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> Apart:
         return self
 
     def __exit__(self, *exc: object) -> None:

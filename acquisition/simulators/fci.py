@@ -17,7 +17,7 @@ import socket
 import struct
 import threading
 from collections import deque
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
@@ -68,7 +68,7 @@ class FciServer:
             self._gripper.close()
             raise
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> FciServer:
         return self
 
     def __exit__(self, *exc: object) -> None:

@@ -14,7 +14,7 @@ import socket
 import struct
 import threading
 import time
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
@@ -64,7 +64,7 @@ class UrServer:
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> UrServer:
         return self
 
     def __exit__(self, *exc: object) -> None:

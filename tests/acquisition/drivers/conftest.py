@@ -1,0 +1,79 @@
+"""The devices that the drivers' tests talk to: simulators on loopback, recordings made on the spot."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from acquisition.simulators.apart import Apart
+from acquisition.simulators.gige import PROGRAM
+from acquisition.simulators.network import NotPermitted, own_network
+
+_COUNT = itertools.count(1)
+
+
+def host() -> str:
+    """A loopback address that no other test run on this machine uses: libfranka's and RTDE's ports are fixed."""
+    return f"127.{20 + os.getpid() % 200}.{os.getpid() // 200 % 250}.{next(_COUNT)}"
+
+
+@pytest.fixture(scope="session")
+def fci() -> Iterator[tuple[str, Apart]]:
+    """A Panda with its gripper: (address, simulator)."""
+    pytest.importorskip("panda_py", reason="panda-python is not installed (rig-franka)")
+    address = host()
+    with Apart("fci", host=address) as simulator:
+        yield address, simulator
+
+
+@pytest.fixture(scope="session")
+def rtde() -> Iterator[tuple[str, Apart]]:
+    """A UR5e controller: (address, simulator)."""
+    pytest.importorskip("rtde_control", reason="ur-rtde is not installed (rig-ur)")
+    address = host()
+    with Apart("rtde", host=address) as simulator:
+        yield address, simulator
+
+
+@pytest.fixture
+def loopback_network() -> Iterator[list[str]]:
+    """A network namespace with three loopback addresses, for GigE Vision's broadcasts."""
+    addresses = ["127.0.0.1", "127.0.0.2", "127.0.0.3"]
+    network = own_network(addresses)
+    try:
+        network.__enter__()
+    except NotPermitted as refused:
+        pytest.skip(f"GigE Vision needs a network namespace: {refused}")
+    yield addresses
+    network.__exit__(None, None, None)
+
+
+@pytest.fixture
+def aravis(loopback_network: list[str]) -> list[str]:
+    """The addresses for simulated GigE cameras, where Aravis is installed."""
+    if shutil.which(PROGRAM) is None:
+        pytest.skip(f"no {PROGRAM}: apt-get install aravis-tools")
+    return loopback_network
+
+
+@pytest.fixture(scope="session")
+def db3(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
+    """`db3(name, **kind)` is a recording of a software D455 (see plain_frames), made once."""
+    pytest.importorskip("pyrealsense2", reason="pyrealsense2 is not installed (rig-realsense)")
+    from acquisition.simulators.realsense_db3 import plain_frames, write_db3
+
+    folder = tmp_path_factory.mktemp("db3")
+
+    def make(name: str, leave_out: range = range(0), count: int = 20, **kind: object) -> Path:
+        path = folder / f"{name}.db3"
+        if not path.exists():
+            frames = list(plain_frames(count, **kind))  # type: ignore[arg-type]
+            write_db3(path, [frame for k, frame in enumerate(frames) if k not in leave_out])
+        return path
+
+    return make

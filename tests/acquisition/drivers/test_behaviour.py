@@ -1,0 +1,230 @@
+"""What every driver promises (acquisition/devices.py), on every backend: the very same tests."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from acquisition.devices import Arm, ArmSamples, DeviceLost, DeviceRefused, Gripper, MonoCamera, RgbdCamera, RgbdCapture
+from acquisition.simulators.apart import Apart
+from recordings.errors import DeviceNotFound
+
+PATIENCE_S = 5.0
+SLACK_S = 0.3
+"""What a loaded machine may add to a timeout."""
+
+
+@dataclass
+class Backend:
+    """How to get a driver of this backend, and how to trouble its device."""
+
+    make: Callable[..., Any]
+    """Keyword `serial` reaches the driver."""
+    protocol: Any
+    lossy: Callable[[], Any]
+    """A driver (not opened) whose device loses something while it streams."""
+    unplug: Callable[[], None]
+    """Takes the device away, for the rest of the test."""
+    items: int = 8
+
+
+@pytest.fixture
+def d455(db3: Callable[..., Path]) -> Backend:
+    from acquisition.drivers.d455 import D455Camera
+
+    whole, gap = db3("plain"), db3("gap", leave_out=range(8, 11))
+    return Backend(
+        make=lambda **given: D455Camera(file=whole, **given),
+        protocol=RgbdCamera,
+        lossy=lambda: D455Camera(file=gap),
+        unplug=lambda: None,  # the recording ends by itself
+    )
+
+
+@pytest.fixture
+def genicam(aravis: list[str]) -> Iterator[Backend]:
+    from acquisition.drivers.genicam import GenicamCamera, GenicamSettings
+    from acquisition.simulators.gige import FakeGvCamera
+
+    settings = GenicamSettings(width=320, height=240, rate_hz=50.0, packet_bytes=1400)
+    with FakeGvCamera(aravis[0], "GV01") as whole, FakeGvCamera(aravis[1], "GV02", lost_per_mille=20):
+        yield Backend(
+            make=lambda serial="GV01": GenicamCamera(serial=serial, settings=settings),
+            protocol=MonoCamera,
+            lossy=lambda: GenicamCamera(serial="GV02", settings=settings),
+            unplug=whole.close,
+        )
+
+
+@pytest.fixture
+def franka(fci: tuple[str, Apart]) -> Iterator[Backend]:
+    from acquisition.drivers.franka import FrankaArm
+
+    address, simulator = fci
+
+    def lossy() -> FrankaArm:
+        simulator.inject("lost_packets", share=0.1)
+        return FrankaArm(host=address)
+
+    yield Backend(lambda **given: FrankaArm(host=address, **given), Arm, lossy, lambda: simulator.inject("unplug"))
+    simulator.clear("unplug")
+    simulator.clear("lost_packets")
+
+
+@pytest.fixture
+def franka_hand(fci: tuple[str, Apart]) -> Iterator[Backend]:
+    from acquisition.drivers.franka_hand import FrankaHand
+
+    address, simulator = fci
+
+    def lossy() -> FrankaHand:
+        simulator.inject("gripper_freeze", at_s=1.0, for_s=0.4)
+        return FrankaHand(host=address)
+
+    yield Backend(
+        lambda **given: FrankaHand(host=address, **given), Gripper, lossy, lambda: simulator.inject("gripper_unplug")
+    )
+    simulator.clear("gripper_unplug")
+
+
+@pytest.fixture
+def ur(rtde: tuple[str, Apart]) -> Iterator[Backend]:
+    from acquisition.drivers.ur import UrArm
+
+    address, simulator = rtde
+
+    def lossy() -> UrArm:
+        simulator.inject("freeze", at_s=1.6, for_s=0.2)
+        return UrArm(host=address)
+
+    yield Backend(lambda **given: UrArm(host=address, **given), Arm, lossy, lambda: simulator.inject("unplug"))
+    simulator.clear("unplug")
+
+
+@pytest.fixture(params=["d455", "genicam", "franka", "franka_hand", "ur"])
+def backend(request: pytest.FixtureRequest) -> Backend:
+    made: Backend = request.getfixturevalue(request.param)
+    return made
+
+
+def marks(item: Any) -> list[tuple[str, int, int, int]]:
+    """(stream, number, device time, receipt) of everything that one read gave."""
+    if isinstance(item, RgbdCapture):
+        return [(i.stream, i.number, i.stamp.device_ns, i.host_ns) for i in item.images()]
+    if isinstance(item, ArmSamples):
+        rows = zip(item.number.tolist(), item.time_ns.tolist(), item.host_ns.tolist())
+        return [("arm", *row) for row in rows]
+    if hasattr(item, "stamp"):
+        return [(item.stream, item.number, item.stamp.device_ns, item.host_ns)]
+    return [("gripper", item.number, item.time_ns, item.host_ns)]
+
+
+def gather(device: Any, items: int) -> list[Any]:
+    """That many reads' worth, or fewer when the device ends."""
+    found: list[Any] = []
+    end = time.monotonic() + PATIENCE_S
+    while len(found) < items and time.monotonic() < end:
+        try:
+            item = device.read(0.5)
+        except DeviceLost:
+            break
+        if item is not None:
+            found.append(item)
+    return found
+
+
+def read_on(device: Any, seconds: float) -> None:
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        device.read(0.2)
+
+
+def test_it_streams_with_growing_numbers_and_stamps_and_says_who_it_is(backend: Backend) -> None:
+    with backend.make() as device:
+        assert isinstance(device, backend.protocol)
+        device.start()
+        found = [mark for item in gather(device, backend.items) for mark in marks(item)]
+        described = json.loads(json.dumps(device.describe()))
+        health = device.health()
+    assert len(found) >= backend.items
+    for stream in {mark[0] for mark in found}:
+        rows = [mark[1:] for mark in found if mark[0] == stream]
+        for i, name in enumerate(("number", "stamp")):
+            steps = [b[i] - a[i] for a, b in zip(rows, rows[1:])]
+            assert all(step > 0 for step in steps), f"{stream}: {name}s {steps}"
+        receipts = [row[2] for row in rows]
+        assert receipts == sorted(receipts)
+        assert 0 <= time.monotonic_ns() - receipts[-1] < 20e9
+    assert {"kind", "model", "serial", "firmware", "driver", "settings", "warnings"} <= set(described)
+    assert sum(health.received.values()) >= backend.items
+
+
+def test_no_read_waits_longer_than_it_was_told(backend: Backend) -> None:
+    with backend.make() as device:
+        device.start()
+        for timeout_s in (0.0, 0.01, 0.2, 0.0):
+            began = time.monotonic()
+            device.read(timeout_s)
+            assert time.monotonic() - began < timeout_s + SLACK_S
+
+
+def test_it_stops_within_two_seconds_and_starts_again(backend: Backend) -> None:
+    with backend.make() as device:
+        for _ in range(2):
+            device.start()
+            assert gather(device, 2)
+            began = time.monotonic()
+            device.stop()
+            assert time.monotonic() - began < 2.0
+
+
+def test_stop_and_close_may_come_at_any_time_and_twice(backend: Backend) -> None:
+    device = backend.make()
+    device.stop()
+    device.close()
+    device.open()
+    device.stop()
+    device.start()
+    for call in (device.stop, device.stop, device.close, device.close):
+        began = time.monotonic()
+        call()
+        assert time.monotonic() - began < 2.0
+
+
+def test_another_serial_is_refused_by_name(backend: Backend) -> None:
+    with pytest.raises((DeviceNotFound, DeviceRefused), match="NO-SUCH-SERIAL"):
+        backend.make(serial="NO-SUCH-SERIAL").open()
+
+
+def test_what_is_lost_is_counted(backend: Backend) -> None:
+    with backend.lossy() as device:
+        device.start()
+        end = time.monotonic() + PATIENCE_S
+        while not sum(device.health().dropped.values()) and time.monotonic() < end:
+            try:
+                device.read(0.2)
+            except DeviceLost:
+                break
+        health = device.health()
+    assert sum(health.dropped.values()) > 0
+
+
+def test_a_device_that_goes_away_is_reported_and_can_be_left(backend: Backend) -> None:
+    device = backend.make()
+    device.open()
+    device.start()
+    assert gather(device, 2)
+    backend.unplug()
+    with pytest.raises(DeviceLost, match=device.name):
+        read_on(device, 12.0)
+    assert device.health().level == "error"
+    for call in (device.stop, device.close):
+        began = time.monotonic()
+        call()
+        assert time.monotonic() - began < 2.0
