@@ -1,6 +1,6 @@
 """Bundle adjustment of cameras that look at known points: poses of cameras, views and tags, lenses where asked for.
 
-A point p of target piece g, seen by camera c in view v, lies in that camera at X = C_c V_v G_g p, with
+A point p of piece g, seen by camera c in view v, lies in that camera at X = C_c V_v G_g (s_g p), with the scale s,
 C = camera_from_rig, V = rig_from_body, G = body_from_piece. Each is free or fixed, and so is each camera's lens.
 Residuals are whitened by the pixels' covariances; Huber's weight tames outliers. Levenberg-Marquardt on the normal
 equations, which are small here (some hundred unknowns). Free poses move by left increments exp([w, t]^) P, so a pose's
@@ -66,6 +66,9 @@ class Scene:
     free_views: Bool[Array, " v"]
     free_pieces: Bool[Array, " g"]
     free_lenses: Bool[Array, " c"]
+    scale: Float[Array, " g"]
+    """True size of a piece / given size; `free_scales` let it be found."""
+    free_scales: Bool[Array, " g"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,6 +171,9 @@ def _blocks(scene: Scene) -> tuple[dict[tuple[str, int], slice], int]:
         count = len(lens_numbers(scene.models[number]))
         blocks["lens", number] = slice(at, at + count)
         at += count
+    for number in np.flatnonzero(scene.free_scales).tolist():
+        blocks["scale", number] = slice(at, at + 1)
+        at += 1
     return blocks, at
 
 
@@ -184,7 +190,7 @@ def with_lens(model: CameraModel, numbers: Float[Array, " k"]) -> CameraModel:
 def _chained(scene: Scene, seen: Observations) -> tuple[Array, Array, Array]:
     """The points in their body, in the rig and in their camera."""
     g, v, c = scene.body_from_piece[seen.piece], scene.rig_from_body[seen.view], scene.camera_from_rig[seen.camera]
-    in_body = np.einsum("nij,nj->ni", g[:, :3, :3], seen.points_m) + g[:, :3, 3]
+    in_body = np.einsum("nij,nj->ni", g[:, :3, :3], scene.scale[seen.piece, None] * seen.points_m) + g[:, :3, 3]
     in_rig = np.einsum("nij,nj->ni", v[:, :3, :3], in_body) + v[:, :3, 3]
     return in_body, in_rig, np.einsum("nij,nj->ni", c[:, :3, :3], in_rig) + c[:, :3, 3]
 
@@ -222,7 +228,7 @@ def _linearised(
     weight = np.ones(len(length)) if huber is None else np.minimum(1.0, huber / length)
     rows, columns, values = [], [], []
     for kind, part in _derivatives(scene, seen, in_camera).items():
-        owner = {"camera": seen.camera, "view": seen.view, "piece": seen.piece, "lens": seen.camera}[kind]
+        owner = {"view": seen.view, "piece": seen.piece, "scale": seen.piece}.get(kind, seen.camera)
         for number in np.unique(owner).tolist():
             where = blocks.get((kind, number))
             if where is None:
@@ -250,6 +256,9 @@ def _derivatives(scene: Scene, seen: Observations, in_camera: Float[Array, "n 3"
         "view": by_point @ R_c @ _by_motion(in_rig),
         "piece": by_point @ R_c @ R_v @ _by_motion(in_body),
     }
+    if scene.free_scales.any():
+        along = np.einsum("nij,nj->ni", scene.body_from_piece[seen.piece, :3, :3], seen.points_m)
+        found["scale"] = by_point @ R_c @ R_v @ along[:, :, None]
     if scene.free_lenses.any():
         found["lens"] = seen.whitening @ _by_lens(scene, seen, in_camera)
     return {kind: np.nan_to_num(part) for kind, part in found.items()}
@@ -314,18 +323,21 @@ def _moved(scene: Scene, blocks: Mapping[tuple[str, int], slice], step: Float[Ar
         "view": scene.rig_from_body.copy(),
         "piece": scene.body_from_piece.copy(),
     }
-    models = list(scene.models)
+    models, scale = list(scene.models), scene.scale.copy()
     for (kind, number), where in blocks.items():
         if kind == "lens":
             moved = lens_numbers(models[number]) + step[where]
             moved[:2] = np.maximum(moved[:2], 1.0)
             moved[2:4] = np.clip(moved[2:4], 0, [models[number].width - 1, models[number].height - 1])
             models[number] = with_lens(models[number], moved)
+        elif kind == "scale":
+            scale[number] *= np.exp(step[where][0] / scale[number])
         else:
             poses[kind][number] = exp_poses(step[where][None])[0] @ poses[kind][number]
     return replace(
         scene,
         models=tuple(models),
+        scale=scale,
         camera_from_rig=poses["camera"],
         rig_from_body=poses["view"],
         body_from_piece=poses["piece"],

@@ -1,13 +1,14 @@
 """Where the cameras stand to one another: one bundle adjustment over all views of a board of known layout.
 
-    placed = calibrate_cameras(models, views, reference="d455")
-    placed.transforms            # d455_from_mono0, ...
+placed = calibrate_cameras(models, views, reference="d455")
+placed.transforms            # d455_from_mono0, ...
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -31,6 +32,9 @@ OUTLIER_VIEW = 3.0
 """A camera's view whose rms is this many times its camera's median is left out."""
 FOLDS = 4
 UNDETERMINED = 1e-9
+BOARD, TABLE = 0, 1
+TABLE_PX = 0.8
+BOARD_SCALE = 0.003
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +44,7 @@ class PlacedCameras:
 
     reference: str
     transforms: tuple[Transform, ...]
+    models: Mapping[str, CameraModel]
     report: Report
     residual_px: Mapping[str, Float[Array, "n 2"]]
     pixels: Mapping[str, Float[Array, "n 2"]]
@@ -47,19 +52,30 @@ class PlacedCameras:
 
 
 def calibrate_cameras(
-    models: Mapping[str, CameraModel], views: Mapping[str, Sequence[TargetView]], reference: str
+    models: Mapping[str, CameraModel],
+    views: Mapping[str, Sequence[TargetView]],
+    reference: str,
+    table: Mapping[str, Sequence[TargetView]] | None = None,
+    lenses_free: bool = False,
 ) -> PlacedCameras:
     """Extrinsics of all cameras from simultaneous views of one rigid board: `views[camera][k]` are of one instant.
 
+    `table`: what the same images show of tags fixed to the table (points in the world). They span more than a board
+    does, so they give the scale, and the board's own is found: a printer is off by a part in a thousand easily. Tags
+    that do not lie where they are said to are left out, and the report says so. `lenses_free`: the lenses are solved with
+    the places, from the given ones; `models` of the result holds them.
     Raises BadInput where the geometry does not connect the cameras, naming those that are cut off.
     """
     names = [reference, *sorted(n for n in models if n != reference)]
-    started = _start(names, models, views)
-    solved, seen, dropped = _without_bad_views(started, _observations(names, views, started))
-    findings = _judge(names, solved, seen)
+    setup = _Setup(names, models, views, _still(names, table))
+    findings, setup = _table_or_not(setup)
+    solved, seen, dropped = _without_bad_views(setup.start, setup.observations(setup.start))
+    if lenses_free:
+        solved = adjust(replace(solved.scene, free_lenses=np.ones(len(names), dtype=bool)), seen)
+    findings += _judge(names, solved, seen)
     if dropped:
-        findings.append(Finding("note", f"left out for their residuals: {', '.join(_named(names, dropped))}"))
-    hold_out = _hold_out(names, models, views, solved)
+        findings.append(Finding("note", f"left out for their residuals: {', '.join(_named(setup, dropped))}"))
+    hold_out = _hold_out(setup, solved)
     findings += limit(hold_out["rms_px"], "the residual on views kept aside", "px", GOOD_PX, WORST_PX)
     figures = per_camera(names, solved, seen)
     report = Report(
@@ -68,15 +84,20 @@ def calibrate_cameras(
         hold_out,
         _uncertainty(names, solved),
         tuple(findings),
-        {"views": {n: f["views"] for n, f in figures.items()}, "points": len(seen)},
+        {
+            "views": {n: f["views"] for n, f in figures.items()},
+            "points": len(seen),
+            "board_scale": float(solved.scene.scale[BOARD]) if solved.scene.free_scales[BOARD] else None,
+        },
     )
     return PlacedCameras(
         reference,
         _transforms(names, solved),
+        dict(zip(names, solved.scene.models)),
         report,
         {n: solved.residual_px[seen.camera == k] for k, n in enumerate(names)},
         {n: seen.pixels[seen.camera == k] for k, n in enumerate(names)},
-        {v: solved.scene.rig_from_body[v] for v in np.unique(seen.view).tolist()},
+        {v: solved.scene.rig_from_body[v] for v in np.unique(seen.view[seen.piece == BOARD]).tolist()},
     )
 
 
@@ -85,29 +106,109 @@ def whitening(covariance_px2: Float[Array, "n 2 2"]) -> Float[Array, "n 2 2"]:
     return np.swapaxes(np.linalg.cholesky(np.linalg.inv(covariance_px2)), -1, -2)
 
 
-def _start(names: Sequence[str], models: Mapping[str, CameraModel], views: Mapping[str, Sequence[TargetView]]) -> Scene:
-    poses = {n: [board_pose(models[n], view) for view in views[n]] for n in names}
-    camera_from_rig = connected(names, poses)
-    count = max(len(v) for v in views.values())
-    rig_from_body, known = np.tile(np.eye(4), (count, 1, 1)), np.zeros(count, dtype=bool)
-    for view in range(count):
-        sights = [(len(views[n][view]), k, poses[n][view]) for k, n in enumerate(names) if view < len(poses[n])]
-        sights = [s for s in sights if s[2]]
-        if sights:
-            _, k, candidates = max(sights, key=lambda s: s[0])
-            rig_from_body[view], known[view] = inverse_poses(camera_from_rig[k]) @ candidates[0], True
-    free = np.arange(len(names)) > 0
-    lenses = np.zeros(len(names), dtype=bool)
-    return Scene(
-        tuple(models[n] for n in names),
-        camera_from_rig,
-        rig_from_body,
-        np.eye(4)[None],
-        free,
-        known,
-        np.zeros(1, dtype=bool),
-        lenses,
-    )
+@dataclass(frozen=True, eq=False)
+class _Setup:
+    """Everything that is given; the table, where it is used, is one more view (the last) of one more piece."""
+
+    names: Sequence[str]
+    models: Mapping[str, CameraModel]
+    views: Mapping[str, Sequence[TargetView]]
+    still: Mapping[str, TargetView]
+
+    @property
+    def count(self) -> int:
+        return max(len(v) for v in self.views.values())
+
+    @cached_property
+    def start(self) -> Scene:
+        poses = {n: [board_pose(self.models[n], view) for view in self.views[n]] for n in self.names}
+        camera_from_rig = connected(self.names, poses)
+        rig_from_body = np.tile(np.eye(4), (self.count + 1, 1, 1))
+        known = np.zeros(self.count + 1, dtype=bool)
+        looks = [*({n: (self.views[n][v], poses[n][v]) for n in self.names} for v in range(self.count))]
+        looks.append({n: (v, board_pose(self.models[n], v)) for n, v in self.still.items()})
+        for view, look in enumerate(looks):
+            sights = [(len(seen), n, candidates) for n, (seen, candidates) in look.items() if candidates]
+            if sights:
+                _, n, candidates = max(sights, key=lambda s: s[0])
+                rig_from_body[view] = inverse_poses(camera_from_rig[self.names.index(n)]) @ candidates[0]
+                known[view] = True
+        cameras, pieces = len(self.names), np.zeros(2, dtype=bool)
+        return Scene(
+            tuple(self.models[n] for n in self.names),
+            camera_from_rig,
+            rig_from_body,
+            np.tile(np.eye(4), (2, 1, 1)),
+            np.arange(cameras) > 0,
+            known,
+            pieces,
+            np.zeros(cameras, dtype=bool),
+            np.ones(2),
+            np.array([bool(self.still), False]),
+        )
+
+    def observations(self, scene: Scene) -> Observations:
+        parts = [
+            (k, number, BOARD, view)
+            for k, n in enumerate(self.names)
+            for number, view in enumerate(self.views[n])
+            if len(view) >= LEAST_POINTS and scene.free_views[number]
+        ]
+        parts += [(self.names.index(n), self.count, TABLE, view) for n, view in self.still.items()]
+        counts = [len(view) for *_, view in parts]
+        return Observations(
+            np.repeat([p[0] for p in parts], counts).astype(np.int64),
+            np.repeat([p[1] for p in parts], counts).astype(np.int64),
+            np.repeat([p[2] for p in parts], counts).astype(np.int64),
+            np.concatenate([view.points_m for *_, view in parts]),
+            np.concatenate([view.pixels for *_, view in parts]),
+            whitening(np.concatenate([view.covariance_px2 for *_, view in parts])),
+        )
+
+
+def _still(names: Sequence[str], table: Mapping[str, Sequence[TargetView]] | None) -> dict[str, TargetView]:
+    """What all images of a camera show of the table, as one view: each point's mean, as sure as in one image (the same
+    pixels give the same error in every image)."""
+    out = {}
+    for name in names if table else ():
+        looks = [view for view in (table or {}).get(name, ()) if len(view)]
+        if not looks:
+            continue
+        ids = np.concatenate([v.ids for v in looks])
+        points, pixels, covariance = (
+            np.concatenate([getattr(v, part) for v in looks]) for part in ("points_m", "pixels", "covariance_px2")
+        )
+        known = [i for i in np.unique(ids) if (ids == i).sum() >= 0.5 * len(looks)]
+        if known:
+            rows = [ids == i for i in known]
+            out[name] = TargetView(
+                np.array(known),
+                np.array([points[r][0] for r in rows]),
+                np.array([np.median(pixels[r], axis=0) for r in rows]),
+                np.array([covariance[r].mean(axis=0) for r in rows]),
+            )
+    return out
+
+
+def _table_or_not(setup: _Setup) -> tuple[list[Finding], _Setup]:
+    """Whether the table's tags lie where they are said to: otherwise they are not used, and that is said."""
+    without = replace(setup, still={})
+    if len(setup.still) < 2 or not setup.start.free_views[setup.count]:
+        return [], without
+    seen = setup.observations(setup.start)
+    solved = adjust(setup.start, seen)
+    on_table = seen.piece == TABLE
+    rms = float(np.sqrt((solved.residual_px[on_table] ** 2).mean()))
+    if rms > TABLE_PX:
+        text = (
+            f"the table's tags do not lie where they are said to (residual {rms:.2f} px, wanted {TABLE_PX:g}): not used"
+        )
+        return [Finding("warning", f"{text}; measure their places, or run `toss-calibrate table`")], without
+    scale = float(solved.scene.scale[BOARD])
+    if abs(scale - 1) > BOARD_SCALE:
+        text = f"the board is {100 * scale:.2f} % of the size it is said to be, by the table's tags"
+        return [Finding("warning", f"{text}; measure its tags and correct size_m")], setup
+    return [], setup
 
 
 def board_pose(model: CameraModel, view: TargetView) -> list[Float[Array, "4 4"]]:
@@ -146,24 +247,6 @@ def connected(
     return np.array([found[n] for n in names])
 
 
-def _observations(names: Sequence[str], views: Mapping[str, Sequence[TargetView]], scene: Scene) -> Observations:
-    parts = [
-        (k, number, view)
-        for k, n in enumerate(names)
-        for number, view in enumerate(views[n])
-        if len(view) >= LEAST_POINTS and scene.free_views[number]
-    ]
-    counts = [len(view) for _, _, view in parts]
-    return Observations(
-        np.repeat([k for k, _, _ in parts], counts),
-        np.repeat([number for _, number, _ in parts], counts),
-        np.zeros(sum(counts), dtype=np.int64),
-        np.concatenate([view.points_m for _, _, view in parts]),
-        np.concatenate([view.pixels for _, _, view in parts]),
-        whitening(np.concatenate([view.covariance_px2 for _, _, view in parts])),
-    )
-
-
 def _without_bad_views(scene: Scene, seen: Observations) -> tuple[Solved, Observations, list[tuple[int, int]]]:
     """Solve, leave out a camera's views that do not fit, solve again."""
     solved = adjust(scene, seen)
@@ -184,16 +267,14 @@ def bad_views(solved: Solved, seen: Observations) -> list[tuple[int, int]]:
     for camera in np.unique(seen.camera).tolist():
         mine = seen.camera == camera
         numbers = np.unique(seen.view[mine])
-        rms = np.array(
-            [np.sqrt((solved.residual_px[mine & (seen.view == v)] ** 2).mean()) for v in numbers.tolist()]
-        )
+        rms = np.array([np.sqrt((solved.residual_px[mine & (seen.view == v)] ** 2).mean()) for v in numbers.tolist()])
         usual = max(float(np.median(rms)), 0.05)
         bad += [(camera, v) for v, r in zip(numbers.tolist(), rms) if r > OUTLIER_VIEW * usual]
     return bad
 
 
-def _named(names: Sequence[str], bad: Sequence[tuple[int, int]]) -> list[str]:
-    return [f"{names[camera]} view {view}" for camera, view in bad]
+def _named(setup: _Setup, bad: Sequence[tuple[int, int]]) -> list[str]:
+    return [f"{setup.names[k]} {'the table' if view == setup.count else f'view {view}'}" for k, view in bad]
 
 
 def per_camera(names: Sequence[str], solved: Solved, seen: Observations) -> dict[str, dict[str, float]]:
@@ -247,27 +328,25 @@ def _transforms(names: Sequence[str], solved: Solved) -> tuple[Transform, ...]:
     )
 
 
-def _hold_out(
-    names: Sequence[str], models: Mapping[str, CameraModel], views: Mapping[str, Sequence[TargetView]], full: Solved
-) -> dict[str, float]:
+def _hold_out(setup: _Setup, full: Solved) -> dict[str, float]:
     """Each quarter of the views is kept aside once: cameras from the others, then only the board's pose from its own
     views. Also how far the cameras move without a quarter."""
-    count = len(full.scene.free_views)
+    numbers = np.arange(setup.count + 1)
     gaps, moves_mm, turns_deg = [], [], []
-    for fold in range(min(FOLDS, count)):
-        aside = np.arange(count) % FOLDS == fold
-        try:
-            rest = _solved_on(names, models, views, full, ~aside)
-        except BadInput:
+    for fold in range(min(FOLDS, setup.count)):
+        aside = (numbers % FOLDS == fold) & (numbers < setup.count)
+        rest = _solved_on(setup, full, ~aside)
+        if rest is None:
             continue
         moved = inverse_poses(rest.scene.camera_from_rig) @ full.scene.camera_from_rig
         moves_mm += [1e3 * float(np.linalg.norm(m[:3, 3])) for m in moved[1:]]
         turns_deg += [angle_deg(m[:3, :3]) for m in moved[1:]]
-        scene = replace(full.scene, camera_from_rig=rest.scene.camera_from_rig, free_cameras=np.zeros(len(names), bool))
-        seen = _observations(names, views, replace(scene, free_views=full.scene.free_views & aside))
+        fixed = np.zeros(len(setup.names), dtype=bool)
+        scene = replace(rest.scene, free_cameras=fixed, free_scales=np.zeros(2, dtype=bool))
+        kept = replace(scene, free_views=full.scene.free_views & aside)
+        seen = replace(setup, still={}).observations(kept)
         if len(seen):
-            kept = replace(scene, free_views=np.isin(np.arange(count), seen.view))
-            gaps.append(adjust(kept, seen).residual_px)
+            gaps.append(adjust(replace(kept, free_views=np.isin(numbers, seen.view)), seen).residual_px)
     rms = float(np.sqrt((np.concatenate(gaps) ** 2).mean())) if gaps else float("nan")
     return {
         "rms_px": rms,
@@ -276,15 +355,12 @@ def _hold_out(
     }
 
 
-def _solved_on(
-    names: Sequence[str],
-    models: Mapping[str, CameraModel],
-    views: Mapping[str, Sequence[TargetView]],
-    full: Solved,
-    keep: Bool[Array, " v"],
-) -> Solved:
+def _solved_on(setup: _Setup, full: Solved, keep: Bool[Array, " v"]) -> Solved | None:
+    """The cameras from some of the views; None where one of them then sees nothing."""
     scene = replace(full.scene, free_views=full.scene.free_views & keep)
-    seen = _observations(names, views, scene)
-    if len(np.unique(seen.camera)) < len(names):
-        raise BadInput("a camera has no views left")
+    if not scene.free_views[: setup.count].any():
+        return None
+    seen = setup.observations(scene)
+    if len(np.unique(seen.camera)) < len(setup.names):
+        return None
     return adjust(replace(scene, free_views=np.isin(np.arange(len(keep)), seen.view)), seen)

@@ -73,7 +73,9 @@ def limit(value: float, what: str, unit: str, fine: float, most: float) -> list[
         return [Finding("refused", f"{what} is not known")]
     if value <= fine:
         return []
-    return [Finding("warning" if value <= most else "refused", f"{what} is {value:.3g} {unit}, wanted at most {fine:g}")]
+    return [
+        Finding("warning" if value <= most else "refused", f"{what} is {value:.3g} {unit}, wanted at most {fine:g}")
+    ]
 
 
 def _said(value: Any) -> str:

@@ -28,7 +28,7 @@ LARGEST_SHIFT = 0.8
 LEAST_CONTRAST = 4.0
 WIDEST_STEP = 0.5
 """A step wider than this share of the reach runs into the pattern's next one: the fit would be drawn to it."""
-FLOOR_PX = 0.05
+FLOOR_PX = 0.07
 """No corner is known better than this: what a lens, a print and a JPEG do besides noise."""
 
 

@@ -39,7 +39,7 @@ Search = Literal["normal", "thorough"]
 PUPIL_SHIFT_PX = 0.5
 """The detector counts a pixel's centre as half, OpenCV as whole numbers."""
 CHUNK = 64
-VERSION = 1
+VERSION = 2
 UNREFINED_SIGMA_PX = 0.6
 LARGE_IMAGE_PX = 1_000_000
 """Images above this many pixels are searched at half size; corners are refined in the whole image."""

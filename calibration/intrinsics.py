@@ -1,0 +1,281 @@
+"""Lenses: focal lengths, principal point and distortion of one camera from views of a board of known layout.
+
+    lens = calibrate_intrinsics("mono0", (1440, 1080), views)
+    lens.model, lens.report.verdict
+
+Several lens models are fitted and judged on views kept aside; the simplest one that is not clearly worse is taken.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray as Array
+
+from calibration.bundle import Observations, Scene, Solved, adjust, lens_numbers, with_lens
+from calibration.extrinsics import LEAST_POINTS, bad_views, board_pose, whitening
+from calibration.report import Finding, Report, limit
+from calibration.targets import TargetView
+from recordings.errors import BadInput
+from recordings.geometry import COEFFICIENTS, CameraModel, DistortionModel
+
+LEAST_VIEWS = 5
+GOOD_VIEWS = 10
+GOOD_PX, WORST_PX = 0.5, 2.0
+GOOD_FOCAL_PERCENT, WORST_FOCAL_PERCENT = 0.3, 2.0
+FOLDS = 4
+CLEARLY_WORSE = 1.05
+"""A lens model with fewer numbers is taken unless its hold-out error is this many times the best one's."""
+CELLS = 6
+LEAST_COVERAGE = 0.6
+LEAST_TILT_DEG = 15.0
+ALPHAS = (0.0, 0.25, 0.5, 0.75, 1.0)
+SAME_MATRIX = 0.01
+DRAWS = 60
+
+
+@dataclass(frozen=True, eq=False)
+class Lens:
+    """A calibrated lens. `residual_px`, `pixels`: (n, 2) seen minus predicted, and where."""
+
+    model: CameraModel
+    report: Report
+    residual_px: Float[Array, "n 2"]
+    pixels: Float[Array, "n 2"]
+
+
+def calibrate_intrinsics(
+    camera: str,
+    size: tuple[int, int],
+    views: Sequence[TargetView],
+    lens_models: Sequence[DistortionModel] = ("none", "brown-conrady", "rational"),
+    given: CameraModel | None = None,
+) -> Lens:
+    """`size`: width and height. `given`: what the camera is said to be (a start, and judged against the result).
+
+    Raises BadInput where there are too few views to try.
+    """
+    used = [view for view in views if len(view) >= LEAST_POINTS]
+    if len(used) < LEAST_VIEWS:
+        raise BadInput(
+            f"{camera} shows the board in {len(used)} of {len(views)} views; wanted at least {LEAST_VIEWS}, better 30: "
+            "`toss-record --calibration board`"
+        )
+    first = given if given is not None and given.distortion_model == "none" else _first_guess(camera, size, used)
+    fits = {kind: _Fit.of(_bare(first, kind), used) for kind in lens_models}
+    kind = _simplest(fits)
+    fit = fits[kind]
+    findings = [*_judge(camera, fit, used, size), *_against_given(camera, given, fit.model)]
+    report = Report(
+        "intrinsics",
+        {"rms_px": fit.solved.rms_px, "views": len(np.unique(fit.seen.view)), "points": len(fit.seen)},
+        {"rms_px": fit.hold_out_px, "rms_px_by_lens": {k: f.hold_out_px for k, f in fits.items()}},
+        _uncertainty(fit),
+        tuple(findings),
+        {"lens": kind, "coverage": coverage(fit.seen.pixels, size), "rejected_views": sorted(fit.rejected)},
+    )
+    return Lens(fit.model, report, fit.solved.residual_px, fit.seen.pixels)
+
+
+def coverage(pixels: Float[Array, "n 2"], size: tuple[int, int]) -> float:
+    """Share of a 6 x 6 grid over the image that holds points."""
+    cell = np.floor(pixels / np.array(size) * CELLS).clip(0, CELLS - 1).astype(int)
+    return len(np.unique(cell[:, 0] * CELLS + cell[:, 1])) / CELLS**2
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    solved: Solved
+    seen: Observations
+    rejected: tuple[int, ...]
+    hold_out_px: float
+
+    @property
+    def model(self) -> CameraModel:
+        return self.solved.scene.models[0]
+
+    @staticmethod
+    def of(start: CameraModel, views: Sequence[TargetView]) -> _Fit:
+        """All views, then without those that do not fit; and each quarter of them kept aside once."""
+        solved, seen = _solve(start, views, range(len(views)))
+        rejected = tuple(v for _, v in bad_views(solved, seen))
+        numbers = [v for v in range(len(views)) if v not in rejected]
+        if rejected and len(numbers) >= LEAST_VIEWS:
+            solved, seen = _solve(start, views, numbers)
+        else:
+            rejected, numbers = (), list(range(len(views)))
+        gaps = []
+        for fold in range(FOLDS):
+            aside = numbers[fold::FOLDS]
+            rest, _ = _solve(solved.scene.models[0], views, [v for v in numbers if v not in aside])
+            gaps.append(_solve(rest.scene.models[0], views, aside, free_lens=False)[0].residual_px)
+        return _Fit(solved, seen, rejected, float(np.sqrt((np.concatenate(gaps) ** 2).mean())))
+
+
+def _solve(
+    start: CameraModel, views: Sequence[TargetView], numbers: Sequence[int], free_lens: bool = True
+) -> tuple[Solved, Observations]:
+    """Lens (where free) and board poses from the views of these numbers."""
+    poses, chosen = np.tile(np.eye(4), (len(views), 1, 1)), []
+    for v in numbers:
+        found = board_pose(start, views[v])
+        if found:
+            poses[v] = found[0]
+            chosen.append(v)
+    if not chosen:
+        raise BadInput(f"no pose of the board fits the views of {start.frame}; is its layout as stated?")
+    counts = [len(views[v]) for v in chosen]
+    seen = Observations(
+        np.zeros(sum(counts), dtype=np.int64),
+        np.repeat(chosen, counts),
+        np.zeros(sum(counts), dtype=np.int64),
+        np.concatenate([views[v].points_m for v in chosen]),
+        np.concatenate([views[v].pixels for v in chosen]),
+        whitening(np.concatenate([views[v].covariance_px2 for v in chosen])),
+    )
+    one, no = np.eye(4)[None], np.zeros(1, dtype=bool)
+    free_views = np.isin(np.arange(len(views)), chosen)
+    scene = Scene((start,), one, poses, one, no, free_views, no, np.array([free_lens]), np.ones(1), no)
+    return adjust(scene, seen), seen
+
+
+def _first_guess(camera: str, size: tuple[int, int], views: Sequence[TargetView]) -> CameraModel:
+    """Zhang's closed form for flat boards, the centre as the principal point."""
+    flat = [v for v in views if np.ptp(v.points_m[:, 2]) < 1e-9]
+    width, height = size
+    K = np.array([[1.2 * width, 0, (width - 1) / 2], [0, 1.2 * width, (height - 1) / 2], [0, 0, 1.0]])
+    if len(flat) >= LEAST_VIEWS:
+        points = [np.ascontiguousarray(v.points_m - v.points_m[0], dtype=np.float32) for v in flat]
+        found = cv2.initCameraMatrix2D(points, [v.pixels.astype(np.float32) for v in flat], size, 1.0)
+        if np.isfinite(found).all() and 0.2 * width < found[0, 0] < 20 * width:
+            K[0, 0] = K[1, 1] = found[0, 0]
+    return CameraModel(camera, width, height, K)
+
+
+def _bare(start: CameraModel, kind: DistortionModel) -> CameraModel:
+    return replace(start, distortion_model=kind, distortion=(0.0,) * COEFFICIENTS[kind])
+
+
+def _simplest(fits: dict[DistortionModel, _Fit]) -> DistortionModel:
+    best = min(f.hold_out_px for f in fits.values())
+    fine = [k for k, f in fits.items() if f.hold_out_px <= CLEARLY_WORSE * best]
+    return min(fine, key=lambda k: COEFFICIENTS[k])
+
+
+def _judge(camera: str, fit: _Fit, views: Sequence[TargetView], size: tuple[int, int]) -> list[Finding]:
+    found = limit(fit.solved.rms_px, f"{camera}'s residual", "px", GOOD_PX, WORST_PX)
+    found += limit(fit.hold_out_px, f"{camera}'s residual on views kept aside", "px", GOOD_PX, WORST_PX)
+    focal = _uncertainty(fit)["focal_percent"]
+    found += limit(focal, f"the deviation of {camera}'s focal length", "%", GOOD_FOCAL_PERCENT, WORST_FOCAL_PERCENT)
+    if fit.rejected:
+        found.append(Finding("note", f"{camera}: {len(fit.rejected)} views left out for their residuals"))
+    if len(views) < GOOD_VIEWS:
+        found.append(Finding("warning", f"{camera} has {len(views)} views, wanted {GOOD_VIEWS} or more"))
+    share = coverage(fit.seen.pixels, size)
+    if share < LEAST_COVERAGE:
+        text = f"{camera}: the board was seen in {100 * share:.0f} % of the image, wanted {100 * LEAST_COVERAGE:.0f} %"
+        found.append(
+            Finding("warning", f"{text}; the lens is guessed elsewhere: show the board {_bare_parts(fit, size)}")
+        )
+    tilt = _tilts_deg(fit)
+    if np.ptp(tilt) < LEAST_TILT_DEG:
+        text = f"{camera}: the board was tilted by {tilt.min():.0f}..{tilt.max():.0f} deg only"
+        found.append(
+            Finding("warning", f"{text}: focal length and distance are hard to tell apart; tilt it up to 45 deg")
+        )
+    return found
+
+
+def _bare_parts(fit: _Fit, size: tuple[int, int]) -> str:
+    """Where in the image there are the fewest points."""
+    side = np.floor(fit.seen.pixels / np.array(size) * 3).clip(0, 2).astype(int)
+    counts = np.zeros((3, 3))
+    np.add.at(counts, (side[:, 1], side[:, 0]), 1)
+    names = np.array(
+        [[f"{v} {h}".strip() for h in ("left", "", "right")] for v in ("upper", "", "lower")], dtype=object
+    )
+    names[1, 1] = "in the middle"
+    empty = names[counts < 0.03 * counts.sum()]
+    return ", ".join(empty.tolist()) or "nearer, so that it fills the image"
+
+
+def _tilts_deg(fit: _Fit) -> Float[Array, " v"]:
+    """Angle between the board's normal and the optical axis, per view."""
+    poses = fit.solved.scene.rig_from_body[np.unique(fit.seen.view)]
+    return np.degrees(np.arccos(np.abs(poses[:, 2, 2]).clip(0, 1)))
+
+
+def _uncertainty(fit: _Fit) -> dict[str, float]:
+    std, model = fit.solved.std("lens", 0), fit.model
+    return {
+        "focal_percent": 100 * float(max(std[0] / model.fx, std[1] / model.fy)),
+        "principal_point_px": float(np.hypot(std[2], std[3])),
+        "projection_px": _projection_spread_px(fit),
+    }
+
+
+def _projection_spread_px(fit: _Fit) -> float:
+    """How far pixels move among lenses drawn from the covariance, over the whole image, after the rotation that
+    explains most of it (a camera's pose would take that up): root mean square over grid and draws."""
+    model, where = fit.model, fit.solved.blocks["lens", 0]
+    u, v = np.meshgrid(np.linspace(0, model.width - 1, 7), np.linspace(0, model.height - 1, 5))
+    pixels = np.stack([u.ravel(), v.ravel()], -1)
+    rays = model.rays(pixels)
+    rays = rays[np.isfinite(rays).all(axis=1)]
+    turned = [model.project(rays + 1e-5 * np.cross(np.eye(3)[k], rays)) - model.project(rays) for k in range(3)]
+    basis = np.linalg.qr(np.stack(turned, -1).reshape(-1, 3))[0]
+    chance = np.random.default_rng(0)
+    numbers, root = lens_numbers(model), _root(fit.solved.covariance[where, where])
+    squares = []
+    for _ in range(DRAWS):
+        drawn = numbers + root @ chance.normal(size=len(numbers))
+        drawn[2:4] = drawn[2:4].clip(0, [model.width - 1, model.height - 1])
+        gap = (with_lens(model, drawn).project(rays) - model.project(rays)).ravel()
+        squares.append(((gap - basis @ (basis.T @ gap)) ** 2).mean())
+    return float(np.sqrt(2 * np.mean(squares)))
+
+
+def _root(covariance: Float[Array, "k k"]) -> Float[Array, "k k"]:
+    values, vectors = np.linalg.eigh(covariance)
+    return vectors * np.sqrt(values.clip(0))
+
+
+def _against_given(camera: str, given: CameraModel | None, fitted: CameraModel) -> list[Finding]:
+    if given is None or (given.width, given.height) != (fitted.width, fitted.height):
+        return []
+    alpha = new_matrix_alpha(given, fitted)
+    if alpha is not None:
+        return [
+            Finding(
+                "warning",
+                f"{camera}: the intrinsics given so far (focal length {given.fx:.1f}) are those of "
+                f"getOptimalNewCameraMatrix (alpha {alpha:g}) with the distortion kept: that matrix belongs to "
+                f"undistorted images, which have no distortion; the camera's own focal length is {fitted.fx:.1f}",
+            )
+        ]
+    change = 100 * abs(fitted.fx / given.fx - 1)
+    if change > WORST_FOCAL_PERCENT:
+        return [Finding("note", f"{camera}: the focal length changed by {change:.1f} % against the one given so far")]
+    return []
+
+
+def new_matrix_alpha(given: CameraModel, fitted: CameraModel) -> float | None:
+    """The alpha with which cv2.getOptimalNewCameraMatrix of the fitted lens gives the matrix that was `given` together
+    with a distortion; None where it does not, or where `given` has no distortion."""
+    if not any(given.distortion) or given.distortion_model == "fisheye" or _same(given.K, fitted.K):
+        return None
+    bend = np.array(given.distortion)
+    for alpha in ALPHAS:
+        new, _ = cv2.getOptimalNewCameraMatrix(fitted.K, bend, (given.width, given.height), alpha)
+        if _same(new, given.K):
+            return alpha
+    return None
+
+
+def _same(a: Float[Array, "3 3"], b: Float[Array, "3 3"]) -> bool:
+    scale = np.array([b[0, 0], b[1, 1], b[0, 0], b[1, 1]])
+    return bool(np.abs((a - b)[[0, 1, 0, 1], [0, 1, 2, 2]] / scale).max() < SAME_MATRIX)
