@@ -104,16 +104,9 @@ def evaluate(
     tracks as they were prepared before.
     """
     prepared = prepared_for(learning, tracks, plane or Plane()) if ready is None else ready
-    start, first = _from(prepared, begin)
-    return evaluate_from(learning, prepared, start, first, steps, step_s, against, plane or Plane())
-
-
-def _from(prepared: Prepared, begin: Literal["first", "release"]) -> tuple[Start, list[int]]:
-    if begin == "release":
-        return starts(prepared)
-    states = [s.states for s in prepared.smoothed]
-    names = ("rotation", "position_m", "spin_object_rad_s", "velocity_world_m_s")
-    return Start(*(np.stack([getattr(s, n)[0] for s in states]) for n in names)), [0] * len(states)
+    first = [0] * len(prepared.tracks) if begin == "first" else None
+    start, frames = starts(prepared, step_s, learning.fitted.inertia_start_kgm2, first)
+    return evaluate_from(learning, prepared, start, frames, steps, step_s, against, plane or Plane())
 
 
 def evaluate_from(
