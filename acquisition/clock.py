@@ -77,6 +77,8 @@ class ClockMapper:
         self._fitted_at_ns = 0
         self._count = 0
         self.steps: list[ClockStep] = []
+        self.told = 0
+        """How many of the steps somebody has been told of."""
         self.wraps = 0
 
     def add(self, device_ns: int, host_ns: int, number: int) -> int:
@@ -98,6 +100,13 @@ class ClockMapper:
             points = np.array(self._points, dtype=np.int64)
             self._line, self._fitted_at_ns = fit_line(points, self._count), self._last[1]
         return self._line
+
+    def unwrap(self, raw_ns: int) -> int:
+        """Another stamp of this clock, from about the time of the last one that was added."""
+        if self._wrap_ns is None or self._last is None:
+            return raw_ns + self._turns_ns
+        turns = round((self._last[0] - raw_ns) / self._wrap_ns)
+        return raw_ns + turns * self._wrap_ns
 
     def _unwrapped(self, raw_ns: int, host_ns: int) -> int:
         """As many turns of the counter as the host's clock saw pass."""

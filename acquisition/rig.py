@@ -1,4 +1,4 @@
-"""A rig file: which devices stand in the lab, what a toss is to be, how it is recorded. TOML; unknown keys are refused."""
+"""A rig file: which devices stand in the lab, what a toss is to be, how it is recorded. Unknown keys are refused."""
 
 from __future__ import annotations
 
@@ -32,7 +32,9 @@ class DeviceEntry:
     kind: Kind
     driver: str
     serial: str = ""
-    """The device's serial number (or address, for a robot); empty: the only one there is."""
+    """Empty: the only one there is."""
+    address: str = ""
+    """Of a device on the network."""
     rate_hz: float = 30.0
     latency_ms: float = 0.0
     """Smallest time from an instant to its receipt, where it is known: it is taken off the stamps."""
@@ -101,6 +103,8 @@ class Rig:
     calibration: Path | None = None
     calibration_hours: float = 24.0
     """An older calibration is warned of."""
+    data_root: Path = Path("sessions")
+    """Where sessions go that are given no folder."""
     recording: RecordingConfig = field(default_factory=RecordingConfig)
     toss: TossConfig | None = None
     """None: tossed by hand."""
@@ -171,14 +175,15 @@ def _check_devices(rig: Rig) -> None:
             raise BadInput(
                 f"{rig.source}: device name '{device.name}'; wanted letters, digits and _ (not ending _depth)"
             )
-        if device.kind == "gripper" or not device.serial:
-            continue  # a hand shares the address of its arm
-        other = seen.setdefault((device.driver, device.serial), device.name)
-        if other != device.name:
-            raise BadInput(
-                f"{rig.source}: '{other}' and '{device.name}' have the same serial {device.serial}; "
-                "every device has its own: see `toss-record --doctor`"
-            )
+        for what, value in (("serial", device.serial), ("address", device.address)):
+            if device.kind == "gripper" or not value:
+                continue  # a hand shares the address of its arm
+            other = seen.setdefault((what, value), device.name)
+            if other != device.name:
+                raise BadInput(
+                    f"{rig.source}: '{other}' and '{device.name}' have the same {what} {value}; "
+                    "every device has its own: see `toss-record --doctor OUT`"
+                )
     for kind in ("arm", "gripper"):
         if len(rig.of_kind(kind)) > 1:
             raise BadInput(f"{rig.source}: {len(rig.of_kind(kind))} devices of kind {kind}; a session has one at most")
@@ -192,8 +197,8 @@ def _check_rate(device: DeviceEntry, source: Path) -> None:
     if device.driver == "d455":
         if rate not in D455_RATES_HZ:
             raise BadInput(f"{where}: a D455 does {', '.join(map(str, D455_RATES_HZ))}")
-        for key in ("color_size", "depth_size"):
-            width, height = device.settings.get(key, (848, 480))
+        for prefix in ("", "color_"):
+            width, height = (int(device.settings.get(prefix + side, 0)) for side in ("width", "height"))
             if width * height > D455_WIDEST_AT_HZ.get(int(rate), 1280 * 800):
                 raise BadInput(f"{where}: a D455 does {width}x{height} only up to 30 frames per second")
     elif device.driver in ARM_RATES_HZ and device.kind == "arm":

@@ -1,4 +1,4 @@
-"""What a toss asks of the arm: a trajectory, the instant at which the fingers are told to open, the release it aims at."""
+"""What a toss asks of the arm: a trajectory, when the fingers are told to open, the release that it aims at."""
 
 from __future__ import annotations
 

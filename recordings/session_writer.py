@@ -142,6 +142,11 @@ class TossWriter:
             for topic in sorted({*accepted, *self._dropped})
         }
 
+    @property
+    def bytes_written(self) -> int:
+        """What the disk has taken so far."""
+        return self._writer.bytes_written
+
     def abandon(self) -> None:
         """Leave the file without its end: `toss-session recover` reads it. Never raises."""
         self._ended = True

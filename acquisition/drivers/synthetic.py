@@ -38,8 +38,10 @@ from acquisition.devices import (
 from acquisition.simulators.faults import Faults
 from acquisition.synthetic.chance import generator
 from acquisition.synthetic.world import Stage
+from acquisition.toss import TossPlan
 from recordings.errors import BadInput
 from recordings.geometry import CameraModel, Transform
+from recordings.progress import Progress
 
 BUFFER_FRAMES = 16
 """What a camera's driver holds for a slow reader; older frames are thrown away and counted."""
@@ -612,3 +614,19 @@ class SyntheticGripper(_Device):
 
     def describe(self) -> dict[str, Any]:
         return {**self._described("simulated Franka Hand", self.rate_hz)}
+
+
+class SyntheticThrower:
+    """Tosses of the simulated lab: planned by its own planner, rendered before they are played."""
+
+    def __init__(self, lab: SyntheticLab) -> None:
+        self._lab = lab
+        self._ready: tuple[int, TossPlan] | None = None
+
+    def prepare(self, toss: int, attempt: int, progress: Progress) -> TossPlan:
+        number = toss + 1000 * attempt
+        if self._ready is None or self._ready[0] != number or self._lab.stage.ready is None:
+            plan = self._lab.show.plan(number)
+            self._lab.stage.set_up(self._lab.show.perform(number, plan, progress))
+            self._ready = number, plan
+        return self._ready[1]

@@ -71,7 +71,7 @@ class Stage:
 
     def exposed_ns(self, stream: str, frame: int) -> int:
         """True mid-exposure of a frame of a stream."""
-        shown = self._at(frame)
+        shown = self.shown_at(frame)
         if shown is not None and 0 <= frame - shown.first_frame < len(shown.performance.reels[stream].times_s):
             reel = shown.performance.reels[stream]
             return self.grid_ns(shown.first_frame) + round(float(reel.times_s[frame - shown.first_frame]) * 1e9)
@@ -79,7 +79,7 @@ class Stage:
 
     def picture(self, stream: str, frame: int) -> Array:
         """What a stream's frame shows. Raises RuntimeError before the first `set_up`."""
-        shown = self._at(frame)
+        shown = self.shown_at(frame)
         if shown is not None:
             return shown.performance.reels[stream].at(frame - shown.first_frame, frame)
         performance = self._next or (self.shown[0].performance if self.shown else None)
@@ -87,7 +87,7 @@ class Stage:
             raise RuntimeError("nothing was set up")
         return performance.reels[stream].at(None, frame)
 
-    def _at(self, frame: int) -> Shown | None:
+    def shown_at(self, frame: int) -> Shown | None:
         """The toss that a frame shows, or its rest; None: the hand holds the object."""
         with self._lock:
             for shown in reversed(self.shown):
@@ -97,12 +97,12 @@ class Stage:
 
     def playing(self, host_ns: int) -> tuple[Shown, float] | None:
         """The toss going on, or over and at rest, at a host time, and the time on its own clock."""
-        shown = self._at(self.frame_before(host_ns))
+        shown = self.shown_at(self.frame_before(host_ns))
         return None if shown is None else (shown, (host_ns - self.grid_ns(shown.first_frame)) / 1e9)
 
     def world_from_object(self, stream: str, frame: int) -> Float[Array, "4 4"] | None:
         """True pose at a frame's exposure; None where the frame shows no toss."""
-        shown = self._at(frame)
+        shown = self.shown_at(frame)
         if shown is None:
             return None
         time_s = (self.exposed_ns(stream, frame) - self.grid_ns(shown.first_frame)) / 1e9

@@ -1,0 +1,308 @@
+# long because: what is seen, how it flies and what follows from it are one story
+"""A toss, watched while it happens: release, first impact, rest, from the gripper's width and thumbnails of depth.
+
+Everything above the table that is not the arm is the object. In flight its middle follows a parabola; where it leaves
+it, the object has hit something. Live, the watcher only has to know when the toss is over; the events are worked out
+from all that was seen, once it is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt16
+from numpy import ndarray as Array
+
+from acquisition.toss_limits import ArmModel
+from recordings.geometry import CameraModel, Transform
+from recordings.records import TossEvent
+
+GRAVITY_M_S2 = 9.81
+TABLE_M = 0.008
+"""Points lower than this belong to the table."""
+HIGHEST_M = 1.2
+REACH_M = 0.6
+"""Half width of the square over the table that is looked at."""
+ARM_MARGIN_M = 0.03
+LINK_M = 0.06
+"""Object points hang together within this."""
+FEWEST_POINTS = 6
+LEFT_PARABOLA_M = 0.02
+STILL_M = 0.0025
+STILL_FOR_S = 0.25
+OPENED_M = 0.002
+LONGEST_FLIGHT_S = 1.5
+
+
+@dataclass(frozen=True, eq=False)
+class Glimpse:
+    """The object in one thumbnail: middle, lowest point (world), how many points."""
+
+    time_s: float
+    middle_m: Float[Array, "3"]
+    lowest_m: float
+    points: int
+
+
+@dataclass(frozen=True)
+class Moment:
+    """A time on the session clock with its standard deviation."""
+
+    time_s: float
+    sigma_s: float
+    source: str
+
+
+@dataclass
+class TossEvents:
+    """What was found; None where it did not show."""
+
+    release: Moment | None = None
+    first_impact: Moment | None = None
+    rest: Moment | None = None
+
+    def records(self) -> list[TossEvent]:
+        """As they are written to a session."""
+        found = []
+        for kind, moment in (("release", self.release), ("first_impact", self.first_impact), ("rest", self.rest)):
+            if moment is not None:
+                time_ns = max(round(moment.time_s * 1e9), 0)
+                found.append(TossEvent(time_ns, kind, moment.source, "", moment.sigma_s))  # type: ignore[arg-type]
+        return found
+
+
+class Eye:
+    """Turns thumbnails into glimpses. `stride`: every how many pixels of the camera's image one was taken."""
+
+    def __init__(
+        self,
+        camera: CameraModel,
+        world_from_camera: Transform,
+        stride: int,
+        arm: ArmModel | None = None,
+        world_from_base: Transform | None = None,
+    ) -> None:
+        self._arm, self._world_from_base = arm, world_from_base
+        rows, columns = np.mgrid[0 : camera.height : stride, 0 : camera.width : stride]
+        self.shape = rows.shape
+        pixels = np.stack([columns, rows], -1).reshape(-1, 2).astype(np.float64)
+        rays = camera.rays(pixels)
+        self._rays_world = (rays / rays[:, 2:]) @ world_from_camera.rotation.T
+        self._origin_m = world_from_camera.translation_m
+
+    def see(
+        self,
+        time_s: float,
+        raw: UInt16[Array, "h w"],
+        unit_m: float,
+        q_rad: Float[Array, " j"] | None,
+        near_m: Array | None,
+    ) -> Glimpse | None:
+        """The object; None where nothing of it shows. Of several things, the one nearest to `near_m`."""
+        depth = raw.reshape(-1).astype(np.float64) * unit_m
+        points = self._origin_m + depth[:, None] * self._rays_world
+        keep = (depth > 0) & (points[:, 2] > TABLE_M) & (points[:, 2] < HIGHEST_M)
+        keep &= (np.abs(points[:, :2]) < REACH_M).all(axis=1)
+        places = np.flatnonzero(keep)
+        found = points[places]
+        if q_rad is not None and self._arm is not None and self._world_from_base is not None and len(found):
+            free = ~self._on_arm(found, q_rad)
+            found, places = found[free], places[free]
+        if len(found) < FEWEST_POINTS:
+            return None
+        found = found[self._one_thing(found, near_m)]
+        if len(found) < FEWEST_POINTS:
+            return None
+        lowest = float(np.percentile(found[:, 2], 3))
+        return Glimpse(time_s, np.median(found, axis=0), lowest, len(found))
+
+    def _on_arm(self, points_m: Float[Array, "n 3"], q_rad: Float[Array, " j"]) -> Bool[Array, " n"]:
+        assert self._arm is not None
+        assert self._world_from_base is not None
+        a, b, radius = self._arm.segments(q_rad)
+        a, b = self._world_from_base.points(a), self._world_from_base.points(b)
+        inside = np.zeros(len(points_m), dtype=bool)
+        for start, end, r in zip(a, b, radius):
+            inside |= _distance_to_segment(points_m, start, end) < r + ARM_MARGIN_M
+        return inside
+
+    def _one_thing(self, points_m: Float[Array, "n 3"], near_m: Array | None) -> Bool[Array, " n"]:
+        """Points that hang together: grown from the point nearest to where the object is thought to be."""
+        if near_m is None:
+            near_m = np.median(points_m, axis=0)
+        inside = np.zeros(len(points_m), dtype=bool)
+        fresh = np.array([int(np.linalg.norm(points_m - near_m, axis=1).argmin())])
+        while len(fresh):
+            inside[fresh] = True
+            rest = np.flatnonzero(~inside)
+            if len(rest) == 0:
+                break
+            low, high = points_m[fresh].min(axis=0) - LINK_M, points_m[fresh].max(axis=0) + LINK_M
+            rest = rest[((points_m[rest] > low) & (points_m[rest] < high)).all(axis=1)]
+            if len(rest) == 0:
+                break
+            gaps = np.linalg.norm(points_m[rest][:, None] - points_m[fresh][None, :: max(1, len(fresh) // 60)], axis=2)
+            fresh = rest[gaps.min(axis=1) < LINK_M]
+        return inside
+
+
+def _distance_to_segment(
+    points_m: Float[Array, "n 3"], a_m: Float[Array, "3"], b_m: Float[Array, "3"]
+) -> Float[Array, " n"]:
+    along = b_m - a_m
+    share = np.clip((points_m - a_m) @ along / max(float(along @ along), 1e-12), 0, 1)
+    return np.linalg.norm(points_m - a_m - share[:, None] * along, axis=1)
+
+
+@dataclass
+class TossWatcher:
+    """Follows one toss. Feed it in time order; `over` says that the object has come to rest."""
+
+    glimpses: list[Glimpse] = field(default_factory=list)
+    widths: list[tuple[float, float]] = field(default_factory=list)
+
+    def saw(self, glimpse: Glimpse | None) -> None:
+        if glimpse is not None:
+            self.glimpses.append(glimpse)
+
+    def width(self, time_s: float, width_m: float) -> None:
+        self.widths.append((time_s, width_m))
+
+    @property
+    def released(self) -> Moment | None:
+        return release_from_widths(np.array(self.widths)) if self.widths else None
+
+    def over(self, now_s: float) -> bool:
+        """Whether the object has been still for a while after it was released."""
+        released = self.released
+        since_s = released.time_s if released is not None else None
+        if since_s is None:
+            since_s = flight_start_s(self.glimpses)
+        if since_s is None or not self.glimpses or self.glimpses[-1].time_s < since_s + 0.2:
+            return False
+        still = still_since_s([g for g in self.glimpses if g.time_s > since_s])
+        return still is not None and now_s - still > STILL_FOR_S
+
+    def events(self) -> TossEvents:
+        """Release, first impact and rest, as far as they show in what was seen."""
+        return find_events(self.glimpses, self.released)
+
+
+def release_from_widths(widths: Float[Array, "n 2"]) -> Moment | None:
+    """When the fingers began to open: back along the opening to the width that was held before."""
+    if len(widths) < 3:
+        return None
+    times, width = widths[:, 0], widths[:, 1]
+    floor = np.minimum.accumulate(width)
+    opened = np.flatnonzero((width - floor > OPENED_M) & (np.arange(len(width)) > 0))
+    lasting = [k for k in opened if (width[k : k + 3] - floor[k] > OPENED_M).all()]
+    if not lasting:
+        return None
+    k = lasting[0]
+    held = float(np.median(width[max(0, k - 10) : k]))
+    before_s, step_s = float(times[k - 1]), float(times[k] - times[k - 1])
+    if k + 1 < len(width) and width[k + 1] > width[k]:
+        speed = (width[k + 1] - width[k]) / max(times[k + 1] - times[k], 1e-6)
+        started = float(times[k] - (width[k] - held) / speed)
+    else:
+        started = before_s + 0.5 * step_s
+    return Moment(float(np.clip(started, before_s - step_s, times[k])), max(0.3 * step_s, 1e-3), "gripper width")
+
+
+def flight_start_s(glimpses: Sequence[Glimpse]) -> float | None:
+    """When a free fall begins that lasts at least four frames (tosses by hand)."""
+    run = _longest_flight(glimpses)
+    return None if run is None else glimpses[run[0]].time_s
+
+
+def _longest_flight(glimpses: Sequence[Glimpse]) -> tuple[int, int] | None:
+    """First and last glimpse of the longest stretch that falls as a stone does."""
+    if len(glimpses) < 4:
+        return None
+    t = np.array([g.time_s for g in glimpses])
+    p = np.array([g.middle_m for g in glimpses])
+    best: tuple[int, int] | None = None
+    for first in range(len(t) - 3):
+        last = first + 3
+        while (
+            last < len(t) and t[last] - t[first] < LONGEST_FLIGHT_S and _falls(t[first : last + 1], p[first : last + 1])
+        ):
+            last += 1
+        if last - first > 3 and (best is None or last - 1 - first > best[1] - best[0]):
+            best = (first, last - 1)
+    return best
+
+
+def _falls(t: Float[Array, " n"], p: Float[Array, "n 3"]) -> bool:
+    """Whether a course is a parabola of free fall: its residual is small, and a resting thing's is not."""
+    s = t - t[0]
+    free = p + np.outer(s**2, [0, 0, GRAVITY_M_S2 / 2])
+    design = np.stack([np.ones_like(s), s], 1)
+    left = free - design @ np.linalg.lstsq(design, free, rcond=None)[0]
+    moved = np.linalg.norm(p[-1] - p[0]) > 0.04
+    return bool(np.sqrt((left**2).sum(axis=1)).max() < 0.015 and moved)
+
+
+def still_since_s(glimpses: Sequence[Glimpse]) -> float | None:
+    """When the object stopped for good: from there to the last glimpse its middle stays within STILL_M, sampled."""
+    if len(glimpses) < 4:
+        return None
+    p = np.array([g.middle_m for g in glimpses])
+    end = np.median(p[-3:], axis=0)
+    away = np.linalg.norm(p - end, axis=1) > 2 * STILL_M
+    last = int(np.flatnonzero(away)[-1]) if away.any() else -1
+    if last + 1 >= len(glimpses) - 1:
+        return None
+    return glimpses[last + 1].time_s
+
+
+def find_events(glimpses: Sequence[Glimpse], released: Moment | None) -> TossEvents:
+    """Everything that the glimpses of a toss tell."""
+    flight = _flight_after(glimpses, released)
+    if flight is None:
+        return TossEvents(released)
+    first, last = flight
+    period_s = float(np.median(np.diff([g.time_s for g in glimpses])))
+    if released is None:
+        released = Moment(glimpses[first].time_s - 0.5 * period_s, 0.4 * period_s, "onset of free fall")
+    impact = _impact(glimpses, first, last, period_s)
+    still = still_since_s(glimpses[last:])
+    rest = Moment(still, period_s, "depth") if still is not None else None
+    return TossEvents(released, impact, rest)
+
+
+def _flight_after(glimpses: Sequence[Glimpse], released: Moment | None) -> tuple[int, int] | None:
+    """First glimpse and last glimpse of the free flight."""
+    if released is None:
+        return _longest_flight(glimpses)
+    after = [i for i, g in enumerate(glimpses) if g.time_s > released.time_s + 0.045]
+    if len(after) < 4:
+        return None
+    t = np.array([glimpses[i].time_s for i in after])
+    p = np.array([glimpses[i].middle_m for i in after])
+    for count in range(4, len(after)):
+        s = t[:count] - t[0]
+        fall = p[:count, 2] + GRAVITY_M_S2 / 2 * s**2
+        course = np.polyfit(s, fall, 1)
+        ahead = t[count] - t[0]
+        predicted = np.polyval(course, ahead) - GRAVITY_M_S2 / 2 * ahead**2
+        if p[count, 2] - predicted > LEFT_PARABOLA_M:
+            return after[0], after[count - 1]
+    return after[0], after[-1]
+
+
+def _impact(glimpses: Sequence[Glimpse], first: int, last: int, period_s: float) -> Moment | None:
+    """Between the last glimpse of the flight and the next one; where the lowest point would pass the table."""
+    if last + 1 >= len(glimpses):
+        return None
+    flight = glimpses[first : last + 1]
+    t = np.array([g.time_s for g in flight])
+    s = t - t[-1]
+    low = np.array([g.lowest_m for g in flight]) + GRAVITY_M_S2 / 2 * s**2
+    slope, level = np.polyfit(s, low, 1)
+    # level + slope s - g s^2 / 2 = 0
+    root = (slope + np.sqrt(max(slope**2 + 2 * GRAVITY_M_S2 * max(level, 0.0), 0.0))) / GRAVITY_M_S2
+    begin, end = glimpses[last].time_s, glimpses[last + 1].time_s
+    return Moment(float(np.clip(begin + root, begin - 0.5 * period_s, end)), 0.3 * period_s, "depth")

@@ -1,0 +1,142 @@
+"""The person at the rig: what is said to them, the keys they press. Headless runs have nobody there."""
+
+from __future__ import annotations
+
+import contextlib
+import select
+import sys
+import time
+from collections.abc import Iterator
+from typing import Literal, Protocol, TextIO, runtime_checkable
+
+from acquisition.verdict import Verdict
+
+Key = Literal["start", "stop", "accept", "reject", "redo", "note", "quit"]
+KEYS: dict[str, Key] = {
+    "s": "start",
+    " ": "start",
+    "x": "stop",
+    "a": "accept",
+    "r": "reject",
+    "d": "redo",
+    "n": "note",
+    "q": "quit",
+}
+KEYS_LINE = "keys: s start, x stop, a accept, r reject, d redo, n note, q quit"
+POLL_S = 0.05
+
+
+@runtime_checkable
+class Operator(Protocol):
+    """Told what happens, asked what to do."""
+
+    headless: bool
+    """Nobody is there to decide."""
+
+    def say(self, text: str) -> None: ...
+    def key(self) -> Key | None:
+        """A key pressed since the last call."""
+
+    def wait_for_start(self) -> Key:
+        """`start`, or `quit`."""
+
+    def decide(self, verdict: Verdict) -> Literal["accept", "reject", "redo"]:
+        """The last word on a take."""
+
+    def note(self) -> str:
+        """A line about the take."""
+
+
+class Nobody:
+    """`--yes`: starts at once, keeps what the recorder accepts, tries a rejected take again."""
+
+    headless = True
+
+    def __init__(self, out: TextIO | None = None) -> None:
+        self._out = out if out is not None else sys.stderr
+
+    def say(self, text: str) -> None:
+        self._out.write(text + "\n")
+        self._out.flush()
+
+    def key(self) -> Key | None:
+        return None
+
+    def wait_for_start(self) -> Key:
+        return "start"
+
+    def decide(self, verdict: Verdict) -> Literal["accept", "reject", "redo"]:
+        return "accept" if verdict.decision == "accept" else "redo"
+
+    def note(self) -> str:
+        return ""
+
+
+class Keyboard(Nobody):
+    """Single keys from a terminal; lines where stdin is no terminal."""
+
+    headless = False
+
+    def key(self) -> Key | None:
+        if not select.select([sys.stdin], [], [], 0)[0]:
+            return None
+        pressed = sys.stdin.read(1) if sys.stdin.isatty() else sys.stdin.readline().strip()[:1]
+        return KEYS.get(pressed.lower()) if pressed else "quit"
+
+    def wait_for_start(self) -> Key:
+        self.say("s: start   q: quit")
+        return self._wait(("start", "quit"))
+
+    def decide(self, verdict: Verdict) -> Literal["accept", "reject", "redo"]:
+        self.say(f"{verdict.text()}\na: accept   r: reject   d: reject and do it again   n: note")
+        key = self._wait(("accept", "reject", "redo", "quit"))
+        if key in ("accept", "reject", "redo"):
+            return key  # type: ignore[return-value]
+        raise KeyboardInterrupt
+
+    def note(self) -> str:
+        self.say("note, then Enter:")
+        with _lines(sys.stdin):
+            return sys.stdin.readline().strip()
+
+    def _wait(self, wanted: tuple[Key, ...]) -> Key:
+        while True:
+            key = self.key()
+            if key in wanted:
+                return key
+            time.sleep(POLL_S)
+
+
+@contextlib.contextmanager
+def single_keys(stream: TextIO) -> Iterator[None]:
+    """Keys come without Enter while this is open; the terminal is left as it was."""
+    if not stream.isatty():
+        yield
+        return
+    import termios
+    import tty
+
+    before = termios.tcgetattr(stream.fileno())
+    try:
+        tty.setcbreak(stream.fileno())
+        yield
+    finally:
+        termios.tcsetattr(stream.fileno(), termios.TCSADRAIN, before)
+
+
+@contextlib.contextmanager
+def _lines(stream: TextIO) -> Iterator[None]:
+    """The other way round: a line with Enter."""
+    if not stream.isatty():
+        yield
+        return
+    import termios
+
+    before = termios.tcgetattr(stream.fileno())
+    cooked = termios.tcgetattr(stream.fileno())
+    cooked[3] |= termios.ICANON | termios.ECHO
+    try:
+        termios.tcsetattr(stream.fileno(), termios.TCSADRAIN, cooked)
+        yield
+    finally:
+        termios.tcsetattr(stream.fileno(), termios.TCSADRAIN, before)
