@@ -40,7 +40,7 @@ def rtde() -> Iterator[tuple[str, Apart]]:
         yield address, simulator
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def loopback_network() -> Iterator[list[str]]:
     """A network namespace with three loopback addresses, for GigE Vision's broadcasts."""
     addresses = ["127.0.0.1", "127.0.0.2", "127.0.0.3"]
@@ -53,7 +53,7 @@ def loopback_network() -> Iterator[list[str]]:
     network.__exit__(None, None, None)
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def aravis(loopback_network: list[str]) -> list[str]:
     """The addresses for simulated GigE cameras, where Aravis is installed."""
     if shutil.which(PROGRAM) is None:

@@ -34,7 +34,7 @@ class Backend:
     items: int = 8
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def d455(db3: Callable[..., Path]) -> Backend:
     from acquisition.drivers.d455 import D455Camera
 
@@ -47,7 +47,7 @@ def d455(db3: Callable[..., Path]) -> Backend:
     )
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def genicam(aravis: list[str]) -> Iterator[Backend]:
     from acquisition.drivers.genicam import GenicamCamera, GenicamSettings
     from acquisition.simulators.gige import FakeGvCamera
@@ -62,7 +62,7 @@ def genicam(aravis: list[str]) -> Iterator[Backend]:
         )
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def franka(fci: tuple[str, Apart]) -> Iterator[Backend]:
     from acquisition.drivers.franka import FrankaArm
 
@@ -77,7 +77,7 @@ def franka(fci: tuple[str, Apart]) -> Iterator[Backend]:
     simulator.clear("lost_packets")
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def franka_hand(fci: tuple[str, Apart]) -> Iterator[Backend]:
     from acquisition.drivers.franka_hand import FrankaHand
 
@@ -93,7 +93,7 @@ def franka_hand(fci: tuple[str, Apart]) -> Iterator[Backend]:
     simulator.clear("gripper_unplug")
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def ur(rtde: tuple[str, Apart]) -> Iterator[Backend]:
     from acquisition.drivers.ur import UrArm
 
@@ -107,10 +107,17 @@ def ur(rtde: tuple[str, Apart]) -> Iterator[Backend]:
     simulator.clear("unplug")
 
 
-@pytest.fixture(params=["d455", "genicam", "franka", "franka_hand", "ur"])
+@pytest.fixture(scope="module", params=["d455", "genicam", "franka", "franka_hand", "ur"])
 def backend(request: pytest.FixtureRequest) -> Backend:
     made: Backend = request.getfixturevalue(request.param)
     return made
+
+
+@pytest.fixture(scope="module")
+def device(backend: Backend) -> Iterator[Any]:
+    """A driver that is open and not started; stopped again by each test."""
+    with backend.make() as opened:
+        yield opened
 
 
 def marks(item: Any) -> list[tuple[str, int, int, int]]:
@@ -145,13 +152,13 @@ def read_on(device: Any, seconds: float) -> None:
         device.read(0.2)
 
 
-def test_it_streams_with_growing_numbers_and_stamps_and_says_who_it_is(backend: Backend) -> None:
-    with backend.make() as device:
-        assert isinstance(device, backend.protocol)
-        device.start()
-        found = [mark for item in gather(device, backend.items) for mark in marks(item)]
-        described = json.loads(json.dumps(device.describe()))
-        health = device.health()
+def test_it_streams_with_growing_numbers_and_stamps_and_says_who_it_is(backend: Backend, device: Any) -> None:
+    assert isinstance(device, backend.protocol)
+    device.start()
+    found = [mark for item in gather(device, backend.items) for mark in marks(item)]
+    described = json.loads(json.dumps(device.describe()))
+    health = device.health()
+    device.stop()
     assert len(found) >= backend.items
     for stream in {mark[0] for mark in found}:
         rows = [mark[1:] for mark in found if mark[0] == stream]
@@ -165,30 +172,28 @@ def test_it_streams_with_growing_numbers_and_stamps_and_says_who_it_is(backend: 
     assert sum(health.received.values()) >= backend.items
 
 
-def test_no_read_waits_longer_than_it_was_told(backend: Backend) -> None:
-    with backend.make() as device:
-        device.start()
-        for timeout_s in (0.0, 0.01, 0.2, 0.0):
-            began = time.monotonic()
-            device.read(timeout_s)
-            assert time.monotonic() - began < timeout_s + SLACK_S
-
-
-def test_it_stops_within_two_seconds_and_starts_again(backend: Backend) -> None:
-    with backend.make() as device:
-        for _ in range(2):
-            device.start()
-            assert gather(device, 2)
-            began = time.monotonic()
-            device.stop()
-            assert time.monotonic() - began < 2.0
-
-
-def test_stop_and_close_may_come_at_any_time_and_twice(backend: Backend) -> None:
-    device = backend.make()
+def test_no_read_waits_longer_than_it_was_told(device: Any) -> None:
+    device.start()
+    for timeout_s in (0.0, 0.01, 0.2, 0.0):
+        began = time.monotonic()
+        device.read(timeout_s)
+        assert time.monotonic() - began < timeout_s + SLACK_S
     device.stop()
-    device.close()
-    device.open()
+
+
+def test_it_stops_within_two_seconds_and_starts_again(device: Any) -> None:
+    for _ in range(2):
+        device.start()
+        assert gather(device, 2)
+        began = time.monotonic()
+        device.stop()
+        assert time.monotonic() - began < 2.0
+
+
+def test_stop_and_close_may_come_at_any_time_and_twice(backend: Backend, device: Any) -> None:
+    unopened = backend.make()
+    unopened.stop()
+    unopened.close()
     device.stop()
     device.start()
     for call in (device.stop, device.stop, device.close, device.close):
