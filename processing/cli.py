@@ -184,23 +184,24 @@ def config_of(args: argparse.Namespace) -> Config:
 def _evaluate(args: argparse.Namespace, session: Session, out: Path) -> Outcome:
     """Scores of all variants in the results folder, table and report."""
     from processing.report import write_report
-    from processing.score import score_variant
+    from processing.score import score_variant, true_mesh
     from processing.stage import locked
     from processing.table import collect, markdown, write_table
     from processing.truth import open_truth
     from recordings.results import Results
 
     results = Results.open(out)
-    scores = {}
+    scores, mesh = {}, None
     for variant in results.variants():
         record = results.find(*variant)
         truth = open_truth(args.truth, session, record.calibration)
         if truth is not None:
             scores[variant] = score_variant(results, record, truth)
+            mesh = true_mesh(truth)
     rows = collect(results, scores)
     with locked(out / ".table.lock"):  # of two runs on one folder, each writes a whole table
         document = write_table(results, rows)
-        write_report(results, document, rows, session)
+        write_report(results, document, rows, session, mesh)
     text = f"{markdown(document)}\nresults: {out}\nreport:  {out / 'report.html'}"
     return Outcome({"session": session.name, "results": str(out), **document}, text)
 

@@ -1,23 +1,30 @@
-"""report.html: one self-contained page with the table, pictures of the fitted mesh and the state of every toss."""
+"""report.html: one self-contained page with the table, the shapes, the errors, the rollouts and every toss."""
 
 from __future__ import annotations
 
 import base64
+import json
 from collections.abc import Sequence
 from html import escape
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from numpy import ndarray as Array
 
+from processing.metrics import distance_to_surface_m
+from processing.report_curves import error_curves, rollout_curves
+from processing.report_shapes import ERROR_FULL_MM, Shown, shape_picture, true_shape
 from processing.table import COLUMNS, Row
 from recordings.geometry import CameraModel
 from recordings.results import Results
 from recordings.session import Session
 from recordings.session_writer import write_bytes
 from recordings.tracks import ObjectShape
+
+if TYPE_CHECKING:
+    import trimesh
 
 PICTURES = 6
 TILE_PX = 360
@@ -28,24 +35,147 @@ td:first-child,th:first-child{text-align:left}th{background:#f3f3f3}.warn{backgr
 .paper{color:#888}figure{margin:1em 0}img{max-width:100%}.bar{display:inline-block;height:.8em}"""
 
 
-def write_report(results: Results, document: dict[str, Any], rows: Sequence[Row], session: Session) -> None:
-    """Write report.html into the results folder. It loads nothing from anywhere."""
+def write_report(
+    results: Results,
+    document: dict[str, Any],
+    rows: Sequence[Row],
+    session: Session,
+    truth: trimesh.Trimesh | None = None,
+) -> None:
+    """Write report.html into the results folder; it loads nothing from anywhere. `truth`: the true mesh, shown too."""
     warnings = [f"{r['variant']} ({r['scope']}): {w}" for r in document["rows"] for w in r["warnings"]]
+    main = _main_row(rows)
     parts = [
         f"<h1>{escape(session.name)}: {escape(session.object_name)}</h1>",
-        _warnings([*warnings, *_lost(document)]),
-        _recorded(document),
+        _warnings([*dict.fromkeys(warnings), *_lost(document)]),
+        _recorded(document, session),
         "<h2>Scores</h2>",
         _score_table(document),
-        *(_figure(results, row, session) for row in rows),
+        _shapes(results, rows, truth),
+        _curves(rows, main),
+        _rollouts(results, main),
+        _phases_table(main),
+        *(_figure(results, row, session) for row in rows if row is main),
         "<h2>Every toss</h2>",
         *(_toss_table(r) for r in document["rows"]),
+        _notes(document),
     ]
     page = (
         f"<!doctype html><html lang=en><meta charset=utf-8><title>{escape(session.name)}</title>"
         f"<style>{STYLE}</style><body>{''.join(parts)}</body></html>"
     )
     write_bytes(results.path / "report.html", page.encode())
+
+
+def _main_row(rows: Sequence[Row]) -> Row | None:
+    """The row that a reader looks at: `ours` over all tosses, else the last one in that scope."""
+    wide = [r for r in rows if r.record.scope == "all"] or list(rows)
+    return next((r for r in wide if r.record.name == "ours"), wide[-1] if wide else None)
+
+
+def _shapes(results: Results, rows: Sequence[Row], truth: trimesh.Trimesh | None) -> str:
+    """The paper's Figure 1: the shape at each step, beside the true one."""
+    shown = []
+    for row in (r for r in rows if r.record.scope == "all" and r.record.shape is not None):
+        toss, track = next(iter(row.tracks.items()))
+        known = np.flatnonzero(np.isfinite(track.camera_from_object[:, 0, 0]))
+        if len(known) == 0:
+            continue
+        shape = results.shape(row.record.name, "all", toss)
+        error = None if truth is None else _distance_to(truth, shape, row)
+        shown.append(Shown(row.record.name, shape, track.camera_from_object[known[0]], error))
+    if not shown:
+        return ""
+    pose = _true_pose(rows, shown)
+    if truth is not None and pose is not None:
+        shown.append(Shown("truth", true_shape(truth), pose))
+    errors = f" Lower row: distance to the truth, white 0 to red {ERROR_FULL_MM:g} mm." if truth is not None else ""
+    caption = (
+        "The shape at each step. Upper row: from the camera's side. Below: from the other side; blue was seen by no "
+        f"camera.{errors}"
+    )
+    return f"<h2>The shape</h2>{_picture(_png(shape_picture(shown)), caption)}"
+
+
+def _true_pose(rows: Sequence[Row], shown: Sequence[Shown]) -> Float[Array, "4 4"] | None:
+    """camera_from_true_object of the frame that the shapes are shown at."""
+    for row in rows:
+        if row.record.name == shown[-1].title and row.score is not None and row.score.tosses:
+            first = row.score.tosses[0]
+            return None if first.shift is None else shown[-1].camera_from_object @ first.shift
+    return None
+
+
+def _distance_to(truth: trimesh.Trimesh, shape: ObjectShape, row: Row) -> Float[Array, " v"] | None:
+    """Distance of each vertex to the true surface, after the alignment that Chamfer is measured in."""
+    if row.score is None or row.score.true_from_shape is None:
+        return None
+    at = row.score.true_from_shape
+    return distance_to_surface_m(truth, shape.vertices_m @ at[:3, :3].T + at[:3, 3])
+
+
+def _curves(rows: Sequence[Row], main: Row | None) -> str:
+    """Errors over time of the main row, beside vision alone."""
+    wanted = [r for r in rows if r.record.scope == "all" and r.record.name in ("bundlesdf-10", "ours", "joint")]
+    wanted = wanted or ([main] if main is not None else [])
+    scored = {r.record.name: r.score.tosses for r in wanted if r.score is not None and r.score.tosses}
+    if not scored:
+        return ""
+    caption = (
+        "Error of every frame, each toss aligned at its first frame. Ground: blue held, white flight, red impact (two "
+        "frames around), green rest. A gap is a lost frame."
+    )
+    return f"<h2>Errors over time</h2>{_picture(error_curves(scored), caption)}"
+
+
+def _rollouts(results: Results, main: Row | None) -> str:
+    """The paper's Figure 4, where the main row learned contact."""
+    stage = None if main is None else main.record.extra.get("rollout")
+    if main is None or not stage:
+        return ""
+    document = json.loads((results.path / stage / "rollout.json").read_text())
+    compared = {"estimated track": document["track"]}
+    if main.score is not None and main.score.rollout is not None:
+        compared["truth"] = main.score.rollout
+    caption = (
+        f"The learned model, rolled out from every toss's release in steps of {1e3 * document['track']['dt_s']:.2f} "
+        f"ms. Learned on the tosses {document['learned']}; dashed: not learned on. Bands: 95 % intervals over tosses."
+    )
+    curves = rollout_curves(compared, document["not_learned"])
+    return f"<h2>Rollouts of the learned contact model</h2>{_picture(curves, caption)}"
+
+
+def _phases_table(main: Row | None) -> str:
+    if main is None or main.score is None or not main.score.phases:
+        return ""
+    titles = {"adds_auc": "ADD-S %", "add_auc": "ADD %", "success_5deg_5cm": "SR %", "median_rotation": "median deg",
+              "p90_rotation": "90 % deg", "median_translation": "median mm", "p90_translation": "90 % mm"}  # fmt: skip
+    names = list(titles)
+    head = "".join(f"<th>{n}</th>" for n in ("phase", "frames", *titles.values()))
+    body = "".join(
+        f"<tr><td>{phase}</td><td>{values[names[0]].n}</td>"
+        + "".join(f"<td>{values[n].value:.2f}</td>" for n in names)
+        + "</tr>"
+        for phase, values in main.score.phases.items()
+    )
+    return f"<h3>{escape(main.record.label)}, phase by phase</h3><table><tr>{head}</tr>{body}</table>"
+
+
+def _notes(document: dict[str, Any]) -> str:
+    lines = [f"{r['variant']} ({r['scope']}): {n}" for r in document["rows"] for n in r["notes"]]
+    return f"<h2>Notes</h2><ul>{''.join(f'<li>{escape(line)}</li>' for line in lines)}</ul>"
+
+
+def _picture(data: bytes, caption: str, kind: str = "png") -> str:
+    coded = base64.b64encode(data).decode()
+    return (
+        f"<figure><img alt='{escape(caption[:40])}' src='data:image/{kind};base64,{coded}'>"
+        f"<figcaption>{escape(caption)}</figcaption></figure>"
+    )
+
+
+def _png(image_rgb: UInt8[Array, "h w 3"]) -> bytes:
+    return cv2.imencode(".png", image_rgb[..., ::-1])[1].tobytes()
 
 
 def _lost(document: dict[str, Any]) -> list[str]:
@@ -61,12 +191,21 @@ def _warnings(lines: Sequence[str]) -> str:
     return f"<div class=warn>{'<br>'.join(escape(line) for line in lines)}</div>" if lines else ""
 
 
-def _recorded(document: dict[str, Any]) -> str:
+def _recorded(document: dict[str, Any], session: Session) -> str:
+    """What was recorded, in a sentence."""
     if not document["rows"]:
         return ""
     tosses = document["rows"][0]["per_toss"]
     frames = sum(t["tracked"] + t["interpolated"] + t["lost"] for t in tosses)
-    return f"<p>{len(tosses)} tosses, {frames} colour and depth frames.</p>"
+    camera = session.calibration.cameras.get("d455")
+    size = "" if camera is None else f" of {camera.width}x{camera.height} pixels"
+    created = session.start.get("created") or session.start.get("wall_time") or ""
+    when = f", recorded {escape(str(created))}" if created else ""
+    return (
+        f"<p>A robot tossed an object ({escape(session.object_name)}) onto a table: {len(tosses)} tosses, {frames} "
+        f"colour and depth frames{size}{when}. From these frames alone come the object's shape, its pose in every "
+        "frame and how it slides and bounces; where a ground truth is known, it is used for the scores only.</p>"
+    )
 
 
 def _score_table(document: dict[str, Any]) -> str:
@@ -91,7 +230,8 @@ def _cell(row: dict[str, Any], name: str) -> str:
 
 def _toss_table(row: dict[str, Any]) -> str:
     names = [n for n in ("adds_auc", "add_auc", "success_5deg_5cm") if any(n in t for t in row["per_toss"])]
-    head = "".join(f"<th>{n}</th>" for n in ("toss", "tracked", "interpolated", "lost", *names))
+    titles = {"adds_auc": "ADD-S %", "add_auc": "ADD %", "success_5deg_5cm": "SR %"}
+    head = "".join(f"<th>{titles.get(n, n)}</th>" for n in ("toss", "tracked", "interpolated", "lost", *names))
     body = "".join(
         f"<tr><td>{t['toss']}</td>"
         + "".join(f"<td>{t[s]}</td>" for s in ("tracked", "interpolated", "lost"))
@@ -104,16 +244,10 @@ def _toss_table(row: dict[str, Any]) -> str:
 
 def _figure(results: Results, row: Row, session: Session) -> str:
     picture = outline_picture(results, row, session)
-    ok, data = cv2.imencode(".jpg", picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 88])
-    if not ok:
-        return ""
-    coded = base64.b64encode(data.tobytes()).decode()
+    data = cv2.imencode(".jpg", picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 88])[1].tobytes()
     caption = "The estimated shape's outline at its estimated pose, over the images. Frames that are lost show none."
     name = f"{row.record.label} (scope {row.record.scope})"
-    return (
-        f"<figure><h2>{escape(name)}</h2><img alt='outlines' src='data:image/jpeg;base64,{coded}'>"
-        f"<figcaption>{caption}</figcaption></figure>"
-    )
+    return f"<h2>{escape(name)}</h2>{_picture(data, caption, 'jpeg')}"
 
 
 def outline_picture(results: Results, row: Row, session: Session) -> UInt8[Array, "h w 3"]:

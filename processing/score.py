@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
@@ -47,13 +47,15 @@ class Value:
 @dataclass(frozen=True, eq=False)
 class TossScore:
     """Scores of one toss, aligned at its own first frame: `errors`, `phase` and `time_s` (since the first frame) of
-    every frame that has a true pose. `phase` is empty where the world is not known."""
+    every frame that has a true pose. `phase` is empty where the world is not known; `shift` is
+    estimated_object_from_true_object."""
 
     toss: int
     errors: FrameErrors
     lost: int
     time_s: Float[Array, " n"]
     phase: tuple[Phase, ...]
+    shift: Float[Array, "4 4"] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,11 +66,15 @@ class VariantScore:
     tosses: tuple[TossScore, ...]
     warnings: tuple[str, ...] = field(default=())
     phases: dict[str, dict[str, Value]] = field(default_factory=dict)
+    true_from_shape: Float[Array, "4 4"] | None = None
+    """Scope all: the alignment that `cd_icp` is measured in."""
+    rollout: dict[str, Any] | None = None
+    """Rollouts against the truth, as JSON."""
 
 
 def score_variant(results: Results, record: VariantRecord, truth: Truth) -> VariantScore:
     """All scores of one variant that the truth allows."""
-    mesh = _true_mesh(truth)
+    mesh = true_mesh(truth)
     if mesh is None:
         return VariantScore({}, (), (f"{truth.folder} has no mesh.obj: ADD and Chamfer cannot be scored",))
     points = surface_points(mesh, POINTS)
@@ -85,7 +91,7 @@ def score_variant(results: Results, record: VariantRecord, truth: Truth) -> Vari
         known = np.isfinite(true[:, 0, 0])
         phase = tuple(p for p, k in zip(_phases(record, track, true, mesh), known) if k)
         time_s = 1e-9 * (track.time_ns[known] - track.time_ns[0])
-        tosses.append(TossScore(toss, errors, int(track.lost.sum()), time_s, phase))
+        tosses.append(TossScore(toss, errors, int(track.lost.sum()), time_s, phase, shift))
     if not tosses:
         return VariantScore({}, (), tuple(warnings))
     values = pose_values(FrameErrors.pooled([t.errors for t in tosses]), "each toss at its own first frame")
@@ -93,9 +99,9 @@ def score_variant(results: Results, record: VariantRecord, truth: Truth) -> Vari
     values["lost_frames"] = Value(float(sum(t.lost for t in tosses)), "frames", frames, "nothing")
     if record.shared_object_frame:
         values |= _with_one_alignment(tracks, truth, points, shifts[min(shifts)])
-    values |= shape_values(results, record, shifts, mesh)
-    values |= contact_values(results, record, truth)
-    return VariantScore(values, tuple(tosses), tuple(warnings), phase_values(tosses))
+    of_shape, placed = shape_values(results, record, shifts, mesh)
+    values |= {**of_shape, **contact_values(results, record, truth)}
+    return VariantScore(values, tuple(tosses), tuple(warnings), phase_values(tosses), placed)
 
 
 def _phases(
@@ -165,8 +171,9 @@ def _with_one_alignment(
 
 def shape_values(
     results: Results, record: VariantRecord, shifts: dict[int, Float[Array, "4 4"]], truth: trimesh.Trimesh
-) -> dict[str, Value]:
-    """Chamfer distances: of the variant's one shape, or the mean over the tosses' own (scope one)."""
+) -> tuple[dict[str, Value], Float[Array, "4 4"] | None]:
+    """Chamfer distances: of the variant's one shape, or the mean over the tosses' own (scope one). Also where the
+    variant's one shape lies after the alignment by ICP."""
     if record.scope == "all":
         first = _first_in_frame_of(results, record, shifts)
         pairs = [(results.shape(record.name, "all"), shifts[first])] if first is not None else []
@@ -176,12 +183,12 @@ def shape_values(
         where = "each toss's first frame, mean over tosses"
     scored = [_chamfers(shape, shift, truth) for shape, shift in pairs if len(shape.faces)]
     if not scored:
-        return {}
-    placed, fitted, cleaned = ([s[k] for s in scored] for k in range(3))
+        return {}, None
+    placed, fitted, cleaned = ([s.placed for s in scored], [s.fitted for s in scored], [s.cleaned for s in scored])
     n = len(scored)
     volumes = [v for shape, _ in pairs if (v := volume_error_percent(_mesh(shape), truth)) is not None]
     volume = {"volume_error": Value(_mean(volumes), "%", len(volumes), "nothing")} if volumes else {}
-    return {
+    values = {
         **volume,
         "cd_icp_cleaned": Value(_mean([c.cm for c in cleaned]), "cm", n, f"{where}, then rigid ICP; biggest part"),
         "cd": Value(_mean([c.cm for c in placed]), "cm", n, where),
@@ -190,6 +197,7 @@ def shape_values(
         "cd_icp_truth_to_estimate": Value(_mean([100 * c.truth_to_estimate_m for c in fitted]), "cm", n, "rigid ICP"),
         "f_score_5mm": Value(100 * _mean([c.f_score_5mm for c in fitted]), "%", n, "rigid ICP"),
     }
+    return values, scored[0].true_from_shape if record.scope == "all" else None
 
 
 def _first_in_frame_of(results: Results, record: VariantRecord, shifts: dict[int, Float[Array, "4 4"]]) -> int | None:
@@ -199,16 +207,25 @@ def _first_in_frame_of(results: Results, record: VariantRecord, shifts: dict[int
     return next((t for t in sorted(shifts) if tracks[t].object_frame == frame), None)
 
 
-def _chamfers(
-    shape: ObjectShape, shift: Float[Array, "4 4"], truth: trimesh.Trimesh
-) -> tuple[Chamfer, Chamfer, Chamfer]:
-    """Chamfer after the alignment of the poses, after a further rigid ICP, and that of the biggest part alone."""
-    mesh = _mesh(shape)
-    mesh.apply_transform(np.linalg.inv(shift))
+@dataclass(frozen=True, eq=False)
+class _Chamfers:
+    """Chamfer after the alignment of the poses, after a further rigid ICP (`true_from_shape`), and there of the biggest
+    part alone."""
+
+    placed: Chamfer
+    fitted: Chamfer
+    cleaned: Chamfer
+    true_from_shape: Float[Array, "4 4"]
+
+
+def _chamfers(shape: ObjectShape, shift: Float[Array, "4 4"], truth: trimesh.Trimesh) -> _Chamfers:
+    mesh, start = _mesh(shape), np.linalg.inv(shift)
+    mesh.apply_transform(start)
     placed = chamfer(mesh, truth)
-    mesh.apply_transform(icp_align(surface_points(mesh, SURFACE_POINTS), surface_points(truth, SURFACE_POINTS)))
+    closer = icp_align(surface_points(mesh, SURFACE_POINTS), surface_points(truth, SURFACE_POINTS))
+    mesh.apply_transform(closer)
     fitted, biggest = chamfer(mesh, truth), biggest_component(mesh)
-    return placed, fitted, fitted if biggest is mesh else chamfer(biggest, truth)
+    return _Chamfers(placed, fitted, fitted if biggest is mesh else chamfer(biggest, truth), closer @ start)
 
 
 def _mesh(shape: ObjectShape) -> trimesh.Trimesh:
@@ -221,7 +238,8 @@ def _mean(values: list[float]) -> float:
     return float(np.mean(values))
 
 
-def _true_mesh(truth: Truth) -> trimesh.Trimesh | None:
+def true_mesh(truth: Truth) -> trimesh.Trimesh | None:
+    """The true surface, where the truth has one. Raises BadInput where it cannot be read."""
     import trimesh
 
     if truth.mesh_path is None:
