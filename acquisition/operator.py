@@ -91,7 +91,7 @@ class Keyboard(Nobody):
         self.say(f"{verdict.text()}\na: accept   r: reject   d: reject and do it again   n: note")
         key = self._wait(("accept", "reject", "redo", "quit"))
         if key in ("accept", "reject", "redo"):
-            return key  # type: ignore[return-value]
+            return key
         raise KeyboardInterrupt
 
     def note(self) -> str:

@@ -32,7 +32,6 @@ class ArmModel:
     """An arm as the planner sees it. Limits per joint, from the base on; `tool` is the link that holds the object.
 
     `torque_nm` and `torque_rate_nm_s` are checked where `urdf_dynamics` says that the model knows its masses.
-    `tool_speed_m_s` and `tool_turn_rad_s` limit the tool (infinite: not limited by its controller).
     """
 
     name: str
@@ -47,8 +46,6 @@ class ArmModel:
     torque_nm: Float[Array, " j"]
     torque_rate_nm_s: Float[Array, " j"]
     capsules: tuple[Capsule, ...]
-    tool_speed_m_s: float
-    tool_turn_rad_s: float
     urdf_dynamics: bool
     source: str
 
@@ -110,8 +107,6 @@ def panda_model() -> ArmModel:
             Capsule("panda_hand", (0.0, -0.05, 0.04), (0.0, 0.05, 0.04), 0.04),
             Capsule("panda_hand", (0.0, -0.04, 0.085), (0.0, 0.04, 0.085), 0.02),
         ),
-        tool_speed_m_s=1.7,
-        tool_turn_rad_s=2.5,
         urdf_dynamics=True,
         source="libfranka 0.9 rate_limiting.h; Franka control parameters of the Panda (FER)",
     )
@@ -154,8 +149,6 @@ def ur5e_model() -> ArmModel:
             Capsule("link5", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.05),
             Capsule("link6", (0.0, 0.0, 0.0), (0.0, 0.0, UR_TOOL_M - 0.04), 0.06),
         ),
-        tool_speed_m_s=np.inf,
-        tool_turn_rad_s=np.inf,
         urdf_dynamics=False,
         source="Universal Robots' data sheet; acceleration and jerk chosen here",
     )
