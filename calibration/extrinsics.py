@@ -62,8 +62,8 @@ def calibrate_cameras(
 
     `table`: what the same images show of tags fixed to the table (points in the world). They span more than a board
     does, so they give the scale, and the board's own is found: a printer is off by a part in a thousand easily. Tags
-    that do not lie where they are said to are left out, and the report says so. `lenses_free`: the lenses are solved with
-    the places, from the given ones; `models` of the result holds them.
+    that do not lie where they are said to are left out, and the report says so. `lenses_free`: the lenses are solved
+    with the places, from the given ones; `models` of the result holds them.
     Raises BadInput where the geometry does not connect the cameras, naming those that are cut off.
     """
     names = [reference, *sorted(n for n in models if n != reference)]

@@ -1,0 +1,369 @@
+"""Where a camera stands to a robot: eye-to-hand (camera fixed, board in the gripper) and eye-in-hand (the other way).
+
+Eye-to-hand: a board point p is seen by the fixed camera at C B_i T p, with B_i = base_from_tool of pose i,
+C = camera_from_base and T = tool_from_board. Eye-in-hand: C B_i^-1 T p with C = camera_from_tool, T = base_from_board.
+Both are A_i X = Y B_i for the board's pose A_i in the camera. Start: Park and Martin (1994) and Daniilidis (1999) on
+the relative motions; then the reprojection errors and the robot's own errors are minimised together, each robot pose
+being free within what the arm is known for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray as Array
+from scipy.linalg import sqrtm
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from calibration.extrinsics import LEAST_POINTS, board_pose, whitening
+from calibration.poses import angle_deg, exp_poses, inverse_poses, log_poses
+from calibration.report import Finding, Report, limit
+from calibration.targets import TargetView
+from recordings.errors import BadInput
+from recordings.geometry import CameraModel
+
+Mounting = Literal["eye-to-hand", "eye-in-hand"]
+LEAST_POSES, GOOD_POSES = 5, 15
+LEAST_TURN_DEG = 30.0
+LEAST_SECOND_AXIS = 0.2
+"""The second rotation axis must have this share of the first one's spread, or the third direction stays unknown."""
+GOOD_MM, WORST_MM = 2.0, 5.0
+GOOD_DEG, WORST_DEG = 0.3, 1.0
+GOOD_PX, WORST_PX = 0.5, 3.0
+FOLDS = 4
+HUBER = 2.5
+
+
+@dataclass(frozen=True)
+class ArmAccuracy:
+    """How well the arm knows its tool's pose, in the tool's frame (standard deviations): a first guess, the data decide."""
+
+    turn_deg: float = 0.05
+    shift_m: float = 0.0003
+
+
+@dataclass(frozen=True, eq=False)
+class HandEye:
+    """`camera_from_mount`: camera_from_base (eye-to-hand) or camera_from_tool (eye-in-hand); `held_from_board`:
+    tool_from_board or base_from_board. `covariance` 6x6 of camera_from_mount: (rotation vector in the camera, m)."""
+
+    mounting: Mounting
+    camera_from_mount: Float[Array, "4 4"]
+    held_from_board: Float[Array, "4 4"]
+    covariance: Float[Array, "6 6"]
+    report: Report
+    residual_px: Float[Array, "n 2"] = field(default_factory=lambda: np.zeros((0, 2)))
+    pixels: Float[Array, "n 2"] = field(default_factory=lambda: np.zeros((0, 2)))
+
+
+def calibrate_hand_eye(
+    model: CameraModel,
+    views: Sequence[TargetView],
+    base_from_tool: Float[Array, "n 4 4"],
+    mounting: Mounting,
+    arm: ArmAccuracy | None = None,
+) -> HandEye:
+    """From one view of the board per robot pose. Views without the board are left out.
+
+    Raises BadInput where too few views show it. Too little rotation is a refusal in the report, with the motion that is
+    missing.
+    """
+    arm = arm or ArmAccuracy()
+    camera_from_board, used = _board_poses(model, views)
+    if len(used) < LEAST_POSES:
+        raise BadInput(
+            f"the board is seen in {len(used)} of {len(views)} robot poses; wanted at least {LEAST_POSES}, better 20: "
+            "`toss-record --calibration hand-eye`"
+        )
+    moved = base_from_tool[used] if mounting == "eye-to-hand" else inverse_poses(base_from_tool[used])
+    missing = missing_motion(moved)
+    start = best_start(camera_from_board, moved)
+    looks = _Looks(model, [views[k] for k in used], moved, mounting)
+    solved = _refine(looks, start, arm)
+    hold_out = _hold_out(looks, start, arm)
+    findings = [Finding("refused", text) for text in missing] + _judge(solved, hold_out, len(used))
+    mm, deg = _spread(solved.covariance)
+    report = Report(
+        f"hand-eye ({mounting})",
+        {"rms_px": solved.rms_px, "robot_deg": solved.robot_deg, "robot_mm": solved.robot_mm, "poses": len(used)},
+        hold_out,
+        {"position_mm": mm, "direction_deg": deg},
+        tuple(findings),
+        {"rotation_span_deg": _span_deg(moved), "views_without_board": len(views) - len(used)},
+    )
+    return HandEye(
+        mounting,
+        solved.camera_from_mount,
+        solved.held_from_board,
+        solved.covariance,
+        report,
+        solved.residual_px,
+        np.concatenate([views[k].pixels for k in used]),
+    )
+
+
+def missing_motion(moved: Float[Array, "n 4 4"]) -> list[str]:
+    """What rotations the poses lack, in words a person at the rig can act on; nothing when they suffice."""
+    span = _span_deg(moved)
+    if span < LEAST_TURN_DEG:
+        return [
+            f"the robot turned by {span:.0f} deg at most between poses, wanted {LEAST_TURN_DEG:.0f} or more (45 is "
+            "good): turn the tool about two different axes, for instance roll +-30 deg and pitch +-30 deg"
+        ]
+    vectors = _relative_turns(moved)
+    values, axes = np.linalg.eigh(vectors.T @ vectors)
+    if np.sqrt(values[1] / values[2]) < LEAST_SECOND_AXIS:
+        axis = axes[:, 2]
+        named = "xyz"[int(np.abs(axis).argmax())]
+        others = " or ".join(a for a in "xyz" if a != named)
+        return [
+            f"the robot turned about one axis only (near its {named}: {np.round(axis, 2).tolist()}), so the camera's "
+            f"place along it cannot be found: add poses that turn the tool about its {others} by 30 deg or more"
+        ]
+    return []
+
+
+def _relative_turns(moved: Float[Array, "n 4 4"]) -> Float[Array, "m 3"]:
+    first, second = np.triu_indices(len(moved), 1)
+    turns = np.swapaxes(moved[first, :3, :3], 1, 2) @ moved[second, :3, :3]
+    return Rotation.from_matrix(turns).as_rotvec()
+
+
+def _span_deg(moved: Float[Array, "n 4 4"]) -> float:
+    return float(np.degrees(np.linalg.norm(_relative_turns(moved), axis=1).max(initial=0.0)))
+
+
+def _board_poses(model: CameraModel, views: Sequence[TargetView]) -> tuple[Float[Array, "n 4 4"], list[int]]:
+    found = {k: board_pose(model, view) for k, view in enumerate(views) if len(view) >= LEAST_POINTS}
+    used = [k for k, candidates in found.items() if candidates]
+    return np.array([found[k][0] for k in used]).reshape(-1, 4, 4), used
+
+
+def best_start(camera_from_board: Float[Array, "n 4 4"], moved: Float[Array, "n 4 4"]) -> tuple[Array, Array]:
+    """(camera_from_mount, held_from_board) by Park and by Daniilidis, whichever leaves less."""
+    starts = [park(camera_from_board, moved), daniilidis(camera_from_board, moved)]
+    return min(starts, key=lambda s: _misfit(camera_from_board, moved, *s))
+
+
+def _misfit(A: Float[Array, "n 4 4"], B: Float[Array, "n 4 4"], X: Array, T: Array) -> float:
+    gap = log_poses(inverse_poses(A) @ (X[None] @ B @ T[None]))
+    return float(np.median(np.linalg.norm(gap[:, :3], axis=1) + np.linalg.norm(gap[:, 3:], axis=1)))
+
+
+def _pairs(A: Float[Array, "n 4 4"], B: Float[Array, "n 4 4"]) -> tuple[Array, Array]:
+    """Relative motions a X = X b with X = camera_from_mount: a = A_j A_i^-1, b = B_j B_i^-1, larger turns only."""
+    i, j = np.triu_indices(len(A), 1)
+    a, b = A[j] @ inverse_poses(A[i]), B[j] @ inverse_poses(B[i])
+    turn = np.linalg.norm(Rotation.from_matrix(b[:, :3, :3]).as_rotvec(), axis=1)
+    keep = (turn >= 0.5 * np.median(turn)) & (turn < np.radians(170))
+    return (a[keep], b[keep]) if keep.sum() >= 3 else (a, b)
+
+
+def park(A: Float[Array, "n 4 4"], B: Float[Array, "n 4 4"]) -> tuple[Array, Array]:
+    """Park and Martin 1994: R = (M^T M)^(-1/2) M^T from rotation vectors, then the translation by least squares."""
+    a, b = _pairs(A, B)
+    alpha, beta = (Rotation.from_matrix(m[:, :3, :3]).as_rotvec() for m in (a, b))
+    M = beta.T @ alpha
+    R = _nearest(np.real(np.linalg.pinv(np.asarray(sqrtm(M.T @ M))) @ M.T))
+    return _completed(A, B, a, b, R)
+
+
+def daniilidis(A: Float[Array, "n 4 4"], B: Float[Array, "n 4 4"]) -> tuple[Array, Array]:
+    """Daniilidis 1999: rotation and translation together from the null space of screw axes' dual quaternions."""
+    a, b = _pairs(A, B)
+    qa, da = _dual(a)
+    qb, db = _dual(b)
+    rows = []
+    for p, dp, q, dq in zip(qa, da, qb, db):
+        top = np.hstack([(p - q)[1:, None], _skew(p[1:] + q[1:]), np.zeros((3, 4))])
+        low = np.hstack([(dp - dq)[1:, None], _skew(dp[1:] + dq[1:]), (p - q)[1:, None], _skew(p[1:] + q[1:])])
+        rows += [top, low]
+    _, _, vt = np.linalg.svd(np.vstack(rows))
+    u1, v1, u2, v2 = vt[6, :4], vt[6, 4:], vt[7, :4], vt[7, 4:]
+    real = _real_mix(u1, v1, u2, v2)
+    R = Rotation.from_quat(np.roll(real, -1)).as_matrix()
+    return _completed(A, B, a, b, R)
+
+
+def _real_mix(u1: Array, v1: Array, u2: Array, v2: Array) -> Float[Array, "4"]:
+    """The unit combination s1 (u1, v1) + s2 (u2, v2) that is a dual quaternion: u . v = 0, |u| = 1."""
+    coefficients = [u1 @ v1, u1 @ v2 + u2 @ v1, u2 @ v2]
+    best, found = -1.0, u2
+    for s in np.real(np.roots(coefficients)) if abs(coefficients[0]) > 1e-15 else np.array([0.0]):
+        mixed = s * u1 + u2
+        if mixed @ mixed > best:
+            best, found = float(mixed @ mixed), mixed
+    return found / np.linalg.norm(found)
+
+
+def _dual(motions: Float[Array, "n 4 4"]) -> tuple[Array, Array]:
+    """Unit quaternions wxyz with w >= 0 and their dual parts 0.5 (0, t) q."""
+    q = np.roll(Rotation.from_matrix(motions[:, :3, :3]).as_quat(canonical=True), 1, axis=1)
+    t = motions[:, :3, 3]
+    dual = 0.5 * np.column_stack([-np.einsum("ij,ij->i", t, q[:, 1:]), q[:, :1] * t + np.cross(t, q[:, 1:])])
+    return q, dual
+
+
+def _completed(A: Array, B: Array, a: Array, b: Array, R: Array) -> tuple[Array, Array]:
+    """The translation of X from (R_a - 1) t = R t_b - t_a, and T as the mean of (X B_i)^-1 A_i."""
+    left = (a[:, :3, :3] - np.eye(3)).reshape(-1, 3)
+    right = (b[:, :3, 3] @ R.T - a[:, :3, 3]).reshape(-1)
+    X = np.eye(4)
+    X[:3, :3], X[:3, 3] = R, np.linalg.lstsq(left, right, rcond=None)[0]
+    held = inverse_poses(X[None] @ B) @ A
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_matrix(held[:, :3, :3]).mean().as_matrix()
+    T[:3, 3] = np.median(held[:, :3, 3], axis=0)
+    return X, T
+
+
+def _nearest(matrix: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
+    u, _, vt = np.linalg.svd(matrix)
+    return u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
+
+
+def _skew(v: Float[Array, "3"]) -> Float[Array, "3 3"]:
+    return np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
+
+
+@dataclass(frozen=True, eq=False)
+class _Refined:
+    camera_from_mount: Float[Array, "4 4"]
+    held_from_board: Float[Array, "4 4"]
+    covariance: Float[Array, "6 6"]
+    residual_px: Float[Array, "n 2"]
+    robot_deg: float
+    robot_mm: float
+
+    @property
+    def rms_px(self) -> float:
+        return float(np.sqrt((self.residual_px**2).mean()))
+
+
+@dataclass(frozen=True, eq=False)
+class _Looks:
+    """The board's views and the robot's motion, one each per pose."""
+
+    model: CameraModel
+    views: Sequence[TargetView]
+    moved: Float[Array, "n 4 4"]
+    mounting: Mounting
+
+    def some(self, keep: Array) -> _Looks:
+        return _Looks(self.model, [v for v, k in zip(self.views, keep) if k], self.moved[keep], self.mounting)
+
+    def corrected(self, off: Float[Array, "n 6"]) -> Float[Array, "n 4 4"]:
+        """The arm errs in its tool's frame, which is on the right of base_from_tool and on the left of its inverse."""
+        small = exp_poses(off)
+        return self.moved @ small if self.mounting == "eye-to-hand" else small @ self.moved
+
+
+def _refine(looks: _Looks, start: tuple[Array, Array], arm: ArmAccuracy) -> _Refined:
+    """Joint least squares; then again with the arm's accuracy that the first round found (between a third and three
+    times of what was assumed)."""
+    first = _solve(looks, start, arm)
+    spare = np.sqrt(max(0.2, 1.0 - 2.0 / len(looks.views)))
+    turn = np.clip(first.robot_deg / np.sqrt(3) / spare, arm.turn_deg / 3, 3 * arm.turn_deg)
+    shift = np.clip(1e-3 * first.robot_mm / np.sqrt(3) / spare, arm.shift_m / 3, 3 * arm.shift_m)
+    found = (first.camera_from_mount, first.held_from_board)
+    return _solve(looks, found, ArmAccuracy(float(turn), float(shift)))
+
+
+def _solve(looks: _Looks, start: tuple[Array, Array], arm: ArmAccuracy) -> _Refined:
+    """Over X, T and a small correction of every robot pose, weighted by the pixels' and the arm's accuracy."""
+    count = len(looks.views)
+    owner = np.repeat(np.arange(count), [len(v) for v in looks.views])
+    points = np.concatenate([v.points_m for v in looks.views])
+    pixels = np.concatenate([v.pixels for v in looks.views])
+    white = whitening(np.concatenate([v.covariance_px2 for v in looks.views]))
+    sigma = np.array([np.radians(arm.turn_deg)] * 3 + [arm.shift_m] * 3)
+
+    def split(numbers: Array) -> tuple[Array, Array, Array]:
+        X = exp_poses(numbers[None, :6])[0] @ start[0]
+        return X, exp_poses(numbers[None, 6:12])[0] @ start[1], numbers[12:].reshape(count, 6) * sigma
+
+    def gaps(numbers: Array) -> Array:
+        X, T, off = split(numbers)
+        chain = (X[None] @ looks.corrected(off) @ T[None])[owner]
+        seen = looks.model.project(np.einsum("nij,nj->ni", chain[:, :3, :3], points) + chain[:, :3, 3])
+        return np.where(np.isfinite(seen), seen - pixels, 1e3)
+
+    def residuals(numbers: Array) -> Array:
+        return np.concatenate([np.einsum("nij,nj->ni", white, gaps(numbers)).ravel(), numbers[12:]])
+
+    done = least_squares(
+        residuals,
+        np.zeros(12 + 6 * count),
+        jac_sparsity=_pattern(owner, count),
+        loss="huber",
+        f_scale=HUBER,
+        x_scale="jac",
+        max_nfev=40,
+    )
+    X, T, off = split(done.x)
+    J = done.jac.toarray() if hasattr(done.jac, "toarray") else done.jac
+    scale = max(1.0, 2.0 * done.cost / max(1, len(done.fun) - len(done.x)))
+    covariance = scale * np.linalg.pinv(J.T @ J, hermitian=True)[:6, :6]
+    turns, shifts = np.linalg.norm(off[:, :3], axis=1), np.linalg.norm(off[:, 3:], axis=1)
+    robot_deg, robot_mm = (float(np.sqrt((v**2).mean())) for v in (np.degrees(turns), 1e3 * shifts))
+    return _Refined(X, T, covariance, -gaps(done.x), robot_deg, robot_mm)
+
+
+def _pattern(owner: Array, count: int) -> Array:
+    """Which residual depends on which number: a view on X, T and its own robot pose."""
+    from scipy.sparse import lil_matrix
+
+    rows = np.repeat(owner, 2)
+    pattern = lil_matrix((len(rows) + 6 * count, 12 + 6 * count), dtype=int)
+    pattern[: len(rows), :12] = 1
+    for k in range(count):
+        mine = np.flatnonzero(rows == k)
+        pattern[mine[:, None], 12 + 6 * k + np.arange(6)] = 1
+    for k in range(6 * count):
+        pattern[len(rows) + k, 12 + k] = 1
+    return pattern
+
+
+def _hold_out(looks: _Looks, start: tuple[Array, Array], arm: ArmAccuracy) -> dict[str, float]:
+    """Each quarter of the poses kept aside once: their boards, predicted by the arm alone, against where they are."""
+    gaps_px, turns, shifts = [], [], []
+    for fold in range(FOLDS):
+        aside = np.arange(len(looks.views)) % FOLDS == fold
+        if (~aside).sum() < LEAST_POSES - 1 or not aside.any():
+            continue
+        solved = _solve(looks.some(~aside), start, arm)
+        for view, moved in zip(looks.some(aside).views, looks.moved[aside]):
+            predicted = solved.camera_from_mount @ moved @ solved.held_from_board
+            points = view.points_m @ predicted[:3, :3].T + predicted[:3, 3]
+            gaps_px.append(looks.model.project(points) - view.pixels)
+            seen = board_pose(looks.model, view)[0]
+            off = inverse_poses(predicted) @ seen
+            turns.append(angle_deg(off[:3, :3]))
+            shifts.append(1e3 * float(np.linalg.norm(predicted[:3, 3] - seen[:3, 3])))
+    if not gaps_px:
+        return {"rms_px": float("nan"), "median_mm": float("nan"), "median_deg": float("nan")}
+    rms = float(np.sqrt(np.nanmean(np.concatenate(gaps_px) ** 2)))
+    return {"rms_px": rms, "median_mm": float(np.median(shifts)), "median_deg": float(np.median(turns))}
+
+
+def _spread(covariance: Float[Array, "6 6"]) -> tuple[float, float]:
+    """Standard deviations in mm and deg, as lengths."""
+    variance = np.diag(covariance)
+    return 1e3 * float(np.sqrt(variance[3:].sum())), float(np.degrees(np.sqrt(variance[:3].sum())))
+
+
+def _judge(solved: _Refined, hold_out: dict[str, float], poses: int) -> list[Finding]:
+    mm, deg = _spread(solved.covariance)
+    found = limit(solved.rms_px, "the residual", "px", GOOD_PX, WORST_PX)
+    found += limit(mm, "the standard deviation of the camera's position", "mm", GOOD_MM, WORST_MM)
+    found += limit(deg, "the standard deviation of the camera's direction", "deg", GOOD_DEG, WORST_DEG)
+    found += limit(hold_out["median_mm"], "the board's error in poses kept aside", "mm", GOOD_MM, 2 * WORST_MM)
+    found += limit(hold_out["median_deg"], "the board's turn in poses kept aside", "deg", GOOD_DEG, 2 * WORST_DEG)
+    if poses < GOOD_POSES:
+        found.append(Finding("warning", f"{poses} poses, wanted {GOOD_POSES} or more"))
+    return found
