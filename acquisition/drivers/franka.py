@@ -77,7 +77,7 @@ def not_opened(what: str, kind: str, reason: str) -> DeviceNotFound | DeviceRefu
         return DeviceNotFound(
             f"{what} needs panda-python, which is not installed ({reason}); run `pip install -e .[rig-franka]`"
         )
-    if "ncompatible" in reason:
+    if "ncompatible" in reason or "protocol version" in reason:
         return DeviceRefused(
             f"{what} speaks another FCI version: {reason} Wanted version 5 (Panda, system >= 4.2.1); "
             "for an FR3 or older firmware another libfranka is needed"

@@ -13,49 +13,23 @@ import math
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 from jaxtyping import UInt8
 from numpy import ndarray as Array
 
-from acquisition.devices import DeviceLost, DeviceRefused, Health, Image, Instant, Stamp
+from acquisition.devices import DeviceLost, DeviceRefused, Health, Image, Stamp
 from acquisition.drivers.aravis import STATUS, Aravis, AravisError, Found
+from acquisition.drivers.genicam_setup import GenicamSettings, apply
 from acquisition.drivers.inbox import Inbox
 from recordings.errors import DeviceNotFound
 
 POP_US = 100_000
 LEAVE_S = 0.8
-CHUNKS = ("Timestamp", "ExposureTime", "Gain")
 FRAME_ID_BITS = 16
 """GigE Vision 1 counts frames from 1 to 65535 and starts over at 1."""
-RATE_TOLERANCE = 0.01
-
-
-@dataclass(frozen=True)
-class GenicamSettings:
-    """What is asked of the camera. None leaves the camera's own value."""
-
-    width: int | None = None
-    height: int | None = None
-    offset_x: int = 0
-    offset_y: int = 0
-    rate_hz: float | None = 30.0
-    """Frames per second; without effect while triggered."""
-    exposure_s: float | None = 0.001
-    gain_db: float | None = None
-    trigger: str = "free"
-    """"free", "software", or the name of the input line."""
-    strobe_line: str | None = None
-    """Output line that is high while this camera exposes."""
-    chunks: bool = True
-    """Ask for the timestamp, exposure and gain of each image inside the image, where the camera can."""
-    timestamp_marks: Instant = "exposure_start"
-    """Which moment the camera's timestamp means. Models differ; `toss-calibrate time` finds what remains."""
-    packet_bytes: int | None = None
-    """GigE packet size; None lets Aravis find the largest that gets through."""
-    buffers: int = 16
 
 
 class GenicamCamera:
@@ -107,7 +81,7 @@ class GenicamCamera:
         inbox, what = self._inbox, f"{self.name}: {self._found}"
         self._keep = self._aravis.on_lost(self._camera, lambda: inbox.lose(f"{what} no longer answers; replug, reopen"))
         try:
-            self._granted = _apply(self._aravis, self._camera, self._settings, self._warnings)
+            self._granted = apply(self._aravis, self._camera, self._settings, self._warnings)
         except AravisError as error:
             self.close()
             raise DeviceRefused(f"{what} refuses its settings: {error}") from error
@@ -212,91 +186,6 @@ class GenicamCamera:
         )
 
 
-def _apply(aravis: Aravis, camera: int, settings: GenicamSettings, warnings: list[str]) -> dict[str, Any]:
-    """Set everything; what the camera granted. Raises AravisError or DeviceRefused."""
-    if settings.width is not None and settings.height is not None:
-        region = (settings.offset_x, settings.offset_y, settings.width, settings.height)
-        aravis.call("arv_camera_set_region", camera, *region)
-    aravis.call("arv_camera_set_pixel_format_from_string", camera, "Mono8")
-    if settings.exposure_s is not None:
-        if aravis.call("arv_camera_is_exposure_auto_available", camera):
-            aravis.call("arv_camera_set_exposure_time_auto", camera, 0)
-        aravis.call("arv_camera_set_exposure_time", camera, settings.exposure_s * 1e6)
-    if settings.gain_db is not None:
-        if aravis.call("arv_camera_is_gain_auto_available", camera):
-            aravis.call("arv_camera_set_gain_auto", camera, 0)
-        aravis.call("arv_camera_set_gain", camera, settings.gain_db)
-    granted: dict[str, Any] = {"exposure_s": aravis.call("arv_camera_get_exposure_time", camera) * 1e-6}
-    _set_trigger(aravis, camera, settings, granted)
-    if aravis.call("arv_camera_is_gv_device", camera):
-        _set_packets(aravis, camera, settings, warnings)
-    granted["chunks"] = settings.chunks and _set_chunks(aravis, camera, warnings)
-    if aravis.call("arv_camera_is_feature_available", camera, "DeviceVersion"):
-        granted["firmware"] = aravis.call("arv_camera_get_string", camera, "DeviceVersion")
-    return granted
-
-
-def _set_trigger(aravis: Aravis, camera: int, settings: GenicamSettings, granted: dict[str, Any]) -> None:
-    if settings.trigger == "free":
-        aravis.call("arv_camera_clear_triggers", camera)
-        if settings.rate_hz is not None:
-            granted["rate_hz"] = _set_rate(aravis, camera, settings.rate_hz)
-    else:
-        source = "Software" if settings.trigger == "software" else settings.trigger
-        try:
-            aravis.call("arv_camera_set_trigger", camera, source)
-        except AravisError as error:
-            raise DeviceRefused(f"the camera has no trigger source '{source}': {error}") from error
-        granted["rate_hz"] = settings.rate_hz
-    if settings.strobe_line is not None:
-        try:
-            for feature, value in (
-                ("LineSelector", settings.strobe_line),
-                ("LineMode", "Output"),
-                ("LineSource", "ExposureActive"),
-            ):
-                aravis.call("arv_camera_set_string", camera, feature, value)
-        except AravisError as error:
-            raise DeviceRefused(f"line '{settings.strobe_line}' cannot tell the exposure: {error}") from error
-
-
-def _set_rate(aravis: Aravis, camera: int, rate_hz: float) -> float:
-    low, high = ctypes.c_double(), ctypes.c_double()
-    aravis.call("arv_camera_get_frame_rate_bounds", camera, ctypes.byref(low), ctypes.byref(high))
-    if rate_hz > high.value > 0:
-        raise DeviceRefused(
-            f"the camera does at most {high.value:.2f} frames/s at this size and exposure, wanted {rate_hz:g}; "
-            "choose a smaller image, a shorter exposure or a lower rate"
-        )
-    aravis.call("arv_camera_set_frame_rate", camera, rate_hz)
-    granted = float(aravis.call("arv_camera_get_frame_rate", camera))
-    if abs(granted - rate_hz) > RATE_TOLERANCE * rate_hz:
-        raise DeviceRefused(f"the camera does {granted:.2f} frames/s, wanted {rate_hz:g}; take a rate it can do")
-    return granted
-
-
-def _set_packets(aravis: Aravis, camera: int, settings: GenicamSettings, warnings: list[str]) -> None:
-    if settings.packet_bytes is not None:
-        aravis.call("arv_camera_gv_set_packet_size", camera, settings.packet_bytes)
-        return
-    size = aravis.call("arv_camera_gv_auto_packet_size", camera)
-    if size < 8000:
-        warnings.append(f"GigE packets of {size} bytes: set the network's MTU to 9000 to lower the load")
-
-
-def _set_chunks(aravis: Aravis, camera: int, warnings: list[str]) -> bool:
-    """Whether images now carry their timestamp, exposure and gain."""
-    if not aravis.call("arv_camera_is_feature_available", camera, "ChunkModeActive"):
-        warnings.append("no chunk data: stamps are the transport's, exposures those that were set")
-        return False
-    try:
-        aravis.call("arv_camera_set_chunks", camera, ",".join(CHUNKS))
-    except AravisError as error:
-        warnings.append(f"chunk data refused ({error}): stamps are the transport's, exposures those that were set")
-        return False
-    return True
-
-
 class _Grabber:
     """The thread that takes finished buffers from Aravis, copies the image and gives the buffer back."""
 
@@ -344,7 +233,7 @@ class _Grabber:
         """Images received whole; images lost as incomplete, in gaps of the frame number, or for want of a reader."""
         dropped = {
             f"{self._name}:incomplete": self._incomplete,
-            f"{self._name}:gap": self._gaps,
+            f"{self._name}:gap": max(0, self._gaps - self._incomplete),  # incomplete ones leave a gap too
             f"{self._name}:overflow": self._inbox.overflowed - self._overflowed_before,
         }
         return {self._name: self._received}, {key: count for key, count in dropped.items() if count}
@@ -364,10 +253,10 @@ class _Grabber:
         status = STATUS.get(self._aravis.call("arv_buffer_get_status", buffer), "unknown")
         if status in ("cleared", "aborted"):
             return
-        number = self._unwrapped(self._aravis.call("arv_buffer_get_frame_id", buffer))
         if status != "success":
-            self._incomplete += 1
+            self._incomplete += 1  # its number may be another frame's: the leader can be what is missing
             return
+        number = self._unwrapped(self._aravis.call("arv_buffer_get_frame_id", buffer))
         self._received += 1
         stamp_ns, exposure_s, gain = self._measured(buffer)
         stamp = Stamp(f"{self._name}/camera", stamp_ns, instant=self._marks)
@@ -380,7 +269,8 @@ class _Grabber:
             return frame_id
         period = (1 << FRAME_ID_BITS) - 1
         step = frame_id - self._number if frame_id > 1 << FRAME_ID_BITS else (frame_id - self._number) % period
-        if step > period // 2:  # out of order: an old one came late
+        if step > period // 2:  # out of order: what looked like a gap came late, whole or not
+            self._gaps = max(0, self._gaps - 1)
             return self._number + step - period
         self._gaps += max(0, step - 1)
         self._number += step

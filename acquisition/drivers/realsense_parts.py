@@ -30,7 +30,8 @@ class FrameCounter:
             self._number = number
             return number
         step = (number - self._number) % WRAP
-        if step >= WRAP // 2:  # out of order: it comes late
+        if step >= WRAP // 2:  # out of order: what looked like a gap comes late
+            self.dropped = max(0, self.dropped - 1)
             return self._number + step - WRAP
         self.dropped += max(0, step - 1)
         self._number += step

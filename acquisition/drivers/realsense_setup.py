@@ -113,7 +113,7 @@ def set_option(sensor: Any, option: Any, value: float, what: str) -> None:
 def _expose(sensor: Any, option: Any, exposure_s: float | None, unit_s: float) -> None:
     set_option(sensor, option.enable_auto_exposure, 1.0 if exposure_s is None else 0.0, "automatic exposure")
     if exposure_s is not None:
-        set_option(sensor, option.exposure, round(exposure_s / unit_s), "the exposure")
+        set_option(sensor, option.exposure, float(round(exposure_s / unit_s)), "the exposure")
 
 
 def _load_json(rs: Any, device: Any, path: Path) -> None:

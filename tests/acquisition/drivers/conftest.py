@@ -42,8 +42,8 @@ def rtde() -> Iterator[tuple[str, Apart]]:
 
 @pytest.fixture(scope="module")
 def loopback_network() -> Iterator[list[str]]:
-    """A network namespace with three loopback addresses, for GigE Vision's broadcasts."""
-    addresses = ["127.0.0.1", "127.0.0.2", "127.0.0.3"]
+    """A network namespace with four loopback addresses, for GigE Vision's broadcasts."""
+    addresses = [f"127.0.0.{i}" for i in range(1, 5)]
     network = own_network(addresses)
     try:
         network.__enter__()
@@ -77,3 +77,9 @@ def db3(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
         return path
 
     return make
+
+
+@pytest.fixture
+def free_host() -> str:
+    """A loopback address where nobody listens."""
+    return host()
