@@ -26,6 +26,10 @@ HIGHEST_M = 1.2
 REACH_M = 0.6
 """Half width of the square over the table that is looked at."""
 ARM_MARGIN_M = 0.03
+MOVED_M = 0.012
+"""A pixel shows something new when it is nearer than before by this."""
+FAR_M = 0.3
+"""The object is not further from where it was expected."""
 LINK_M = 0.06
 """Object points hang together within this."""
 FEWEST_POINTS = 6
@@ -89,8 +93,21 @@ class Eye:
         self.shape = rows.shape
         pixels = np.stack([columns, rows], -1).reshape(-1, 2).astype(np.float64)
         rays = camera.rays(pixels)
+        self._background: Array | None = None
         self._rays_world = (rays / rays[:, 2:]) @ world_from_camera.rotation.T
         self._origin_m = world_from_camera.translation_m
+
+    def learn(self, raws: Sequence[UInt16[Array, "h w"]], unit_m: float) -> None:
+        """What stands there before the toss is no object, as long as it is where it was."""
+        if len(raws):
+            stack = np.array([raw.reshape(-1) for raw in raws]).astype(np.float64) * unit_m
+            self._background = np.median(np.where(stack > 0, stack, np.inf), axis=0)
+
+    def tool_m(self, q_rad: Float[Array, " j"] | None) -> Float[Array, "3"] | None:
+        """Where the hand is, in the world; None where nobody knows."""
+        if q_rad is None or self._arm is None or self._world_from_base is None:
+            return None
+        return self._world_from_base.points(self._arm.base_from_tool(q_rad).translation_m[None])[0]
 
     def see(
         self,
@@ -98,25 +115,24 @@ class Eye:
         raw: UInt16[Array, "h w"],
         unit_m: float,
         q_rad: Float[Array, " j"] | None,
-        near_m: Array | None,
+        near_m: Float[Array, "3"] | None,
     ) -> Glimpse | None:
         """The object; None where nothing of it shows. Of several things, the one nearest to `near_m`."""
         depth = raw.reshape(-1).astype(np.float64) * unit_m
         points = self._origin_m + depth[:, None] * self._rays_world
         keep = (depth > 0) & (points[:, 2] > TABLE_M) & (points[:, 2] < HIGHEST_M)
         keep &= (np.abs(points[:, :2]) < REACH_M).all(axis=1)
-        places = np.flatnonzero(keep)
-        found = points[places]
+        if self._background is not None:
+            keep &= depth < self._background - MOVED_M
+        found = points[keep]
         if q_rad is not None and self._arm is not None and self._world_from_base is not None and len(found):
-            free = ~self._on_arm(found, q_rad)
-            found, places = found[free], places[free]
+            found = found[~self._on_arm(found, q_rad)]
         if len(found) < FEWEST_POINTS:
             return None
         found = found[self._one_thing(found, near_m)]
-        if len(found) < FEWEST_POINTS:
+        if len(found) < FEWEST_POINTS or (near_m is not None and np.linalg.norm(found.mean(axis=0) - near_m) > FAR_M):
             return None
-        lowest = float(np.percentile(found[:, 2], 3))
-        return Glimpse(time_s, np.median(found, axis=0), lowest, len(found))
+        return Glimpse(time_s, np.median(found, axis=0), float(np.percentile(found[:, 2], 3)), len(found))
 
     def _on_arm(self, points_m: Float[Array, "n 3"], q_rad: Float[Array, " j"]) -> Bool[Array, " n"]:
         assert self._arm is not None
@@ -162,6 +178,20 @@ class TossWatcher:
 
     glimpses: list[Glimpse] = field(default_factory=list)
     widths: list[tuple[float, float]] = field(default_factory=list)
+
+    def expected_m(self, time_s: float, tool_m: Float[Array, "3"] | None) -> Float[Array, "3"] | None:
+        """Where to look for the object: at the hand until it is released, then on from where it was last seen."""
+        if tool_m is not None and (self.released is None or time_s < self.released.time_s + 0.03):
+            return tool_m
+        if not self.glimpses:
+            return None
+        last = self.glimpses[-1]
+        if len(self.glimpses) < 2 or time_s - last.time_s > 0.1:
+            return last.middle_m
+        before = self.glimpses[-2]
+        return last.middle_m + (last.middle_m - before.middle_m) * (time_s - last.time_s) / (
+            last.time_s - before.time_s
+        )
 
     def saw(self, glimpse: Glimpse | None) -> None:
         if glimpse is not None:
@@ -246,12 +276,13 @@ def _falls(t: Float[Array, " n"], p: Float[Array, "n 3"]) -> bool:
 
 
 def still_since_s(glimpses: Sequence[Glimpse]) -> float | None:
-    """When the object stopped for good: from there to the last glimpse its middle stays within STILL_M, sampled."""
-    if len(glimpses) < 4:
+    """When the object stopped for good: from there on its middle stays where it is at the end, but for noise."""
+    if len(glimpses) < 6:
         return None
     p = np.array([g.middle_m for g in glimpses])
-    end = np.median(p[-3:], axis=0)
-    away = np.linalg.norm(p - end, axis=1) > 2 * STILL_M
+    end = np.median(p[-6:], axis=0)
+    noise_m = float(np.median(np.linalg.norm(p[-6:] - end, axis=1)))
+    away = np.linalg.norm(p - end, axis=1) > max(2 * STILL_M, 3.5 * noise_m)
     last = int(np.flatnonzero(away)[-1]) if away.any() else -1
     if last + 1 >= len(glimpses) - 1:
         return None

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from acquisition.detect import Eye, Glimpse, TossEvents, TossWatcher
+from acquisition.detect import Eye, TossEvents, TossWatcher
 from acquisition.devices import Arm, DeviceLost, DeviceRefused, Gripper
 from acquisition.gate import Trouble
 from acquisition.interrupts import Interrupts
@@ -263,7 +263,11 @@ class _Running:
         self.seconds = 0.0
         self.write_failure = ""
         self._throw: Throw | None = None
-        self._seen_look_ns = self._seen_width_ns = time.monotonic_ns() - 500_000_000
+        before_ns = time.monotonic_ns() - round(run.config.pre_trigger_s * 1e9)
+        self._seen_look_ns = self._seen_width_ns = before_ns
+        still = [look for look in list(run.recorder.looks) if look.host_ns > before_ns]
+        if run.eye is not None and still:
+            run.eye.learn([look.raw for look in still], still[-1].unit_m)
 
     def throw(self) -> None:
         """Set the arm going, where there is a plan."""
@@ -350,9 +354,8 @@ class _Running:
         for look in [k for k in list(recorder.looks) if k.host_ns > self._seen_look_ns]:
             self._seen_look_ns = look.host_ns
             q = recorder.joints_at(look.host_ns)
-            near = self.watcher.glimpses[-1].middle_m if self.watcher.glimpses else None
-            glimpse: Glimpse | None = run.eye.see(look.time_ns / 1e9, look.raw, look.unit_m, q, near)
-            self.watcher.saw(glimpse)
+            near = self.watcher.expected_m(look.time_ns / 1e9, run.eye.tool_m(q))
+            self.watcher.saw(run.eye.see(look.time_ns / 1e9, look.raw, look.unit_m, q, near))
 
     def command(self) -> TossCommand | None:
         """What the arm was asked, for the file."""
