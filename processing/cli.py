@@ -56,6 +56,9 @@ def _parser() -> Parser:
     )
     parser.add_argument("--tracker", metavar="NAME", default=TRACKERS[0], help=f"one of: {', '.join(TRACKERS)}")
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="cpu (default) or cuda")
+    parser.add_argument(
+        "--executor", choices=("local", "slurm"), default="local", help="where several sessions run (local processes)"
+    )
     add_masks_argument(parser)
     import_module(CONTACT).add_arguments(parser)
     parser.set_defaults(work=_work)
@@ -70,11 +73,37 @@ def _work(args: argparse.Namespace) -> Outcome:
     sessions = [_session_path(s) for s in args.sessions] or [_sample_path()]
     if len(sessions) > 1 and args.truth is not None:
         raise BadInput("--truth DIR belongs to one session; with several, each one's own truth/ is used")
-    outcomes = [_process_one(args, path, name, len(sessions) > 1) for path in sessions]
-    if len(outcomes) == 1:
-        return outcomes[0]
-    worst = max(o.exit_code for o in outcomes)
-    return Outcome({"sessions": [o.document for o in outcomes]}, "\n\n".join(o.text for o in outcomes), worst)
+    if args.truth is not None and not args.truth.is_dir():
+        raise BadInput(f"{args.truth} is no truth: wanted a folder, a session's truth/ or a *_truth folder")
+    return _process(args, sessions[0], name, several=False) if len(sessions) == 1 else _many(args, sessions, name)
+
+
+def _many(args: argparse.Namespace, sessions: Sequence[Path], name: str) -> Outcome:
+    """Every session in a process of its own; one that fails does not stop the others. Then a table over all."""
+    from processing.executor import Task, run_all
+    from processing.table import summary
+
+    plain = {k: v for k, v in vars(args).items() if k != "work"}
+    tasks = [Task(path.stem, _logs_of(args, path), (plain, path, name)) for path in sessions]
+    found = run_all(process_alone, tasks, args.executor, progress_for("sessions"))
+    codes = [int(f.pop("exit_code", TosslabError.exit_code)) for f in found]
+    documents = [{"session": t.name, **f} for t, f in zip(tasks, found, strict=True)]
+    return Outcome({"sessions": documents}, summary(documents), max(codes))
+
+
+def process_alone(arguments: dict[str, Any], path: Path, name: str) -> dict[str, Any]:
+    """One of several sessions, in its own process: its document, or why it failed."""
+    try:
+        outcome = _process(argparse.Namespace(**arguments), path, name, several=True)
+    except TosslabError as wrong:
+        return {"session": str(path), "error": str(wrong), "exit_code": wrong.exit_code}
+    return {**outcome.document, "exit_code": outcome.exit_code}
+
+
+def _logs_of(args: argparse.Namespace, path: Path) -> Path:
+    """Where the processes of several sessions keep their logs."""
+    base = args.out if args.out is not None else path if path.is_dir() else path.parent
+    return Path(base) / ".jobs"
 
 
 def _refuse_what_is_not_there(args: argparse.Namespace) -> None:
@@ -108,16 +137,6 @@ def _sample_path() -> Path:
     if not path.exists():
         raise BadInput(f"the shipped sample is not at {path}; name a session: toss-process SESSION")
     return path
-
-
-def _process_one(args: argparse.Namespace, path: Path, name: str, several: bool) -> Outcome:
-    """One session. Of several, one that fails does not stop the others."""
-    try:
-        return _process(args, path, name, several)
-    except TosslabError as wrong:
-        if not several:
-            raise
-        return Outcome({"session": str(path), "error": str(wrong)}, f"{path}: {wrong}", wrong.exit_code)
 
 
 def _process(args: argparse.Namespace, path: Path, name: str, several: bool) -> Outcome:

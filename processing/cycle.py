@@ -173,7 +173,7 @@ def place_stage(run: Run, toss: int, together: Done, alone: Done, shape: Done) -
     return run.store.run("place", 1, {}, inputs, compute)
 
 
-def placement(own: ObjectTrack, shared: ObjectTrack) -> tuple[Float[Array, "4 4"], dict[str, float]]:
+def placement(own: ObjectTrack, shared: ObjectTrack) -> tuple[Float[Array, "4 4"], dict[str, float | int]]:
     """own_object_from_shared_object by the frames that both tracked, and how far they are from agreeing.
 
     The chordal mean of all frames' motions, then once more without the frames further off than three times the median.
@@ -190,7 +190,10 @@ def placement(own: ObjectTrack, shared: ObjectTrack) -> tuple[Float[Array, "4 4"
         turn = np.array([float(rotation_angle_rad(s[:3, :3] @ mean[:3, :3].T)) for s in steps])
         shift = np.linalg.norm(steps[:, :3, 3] - mean[:3, 3], axis=1)
         use = (turn <= 3 * np.median(turn) + 1e-9) & (shift <= 3 * np.median(shift) + 1e-9)
-    figures = {"rotation_deg": float(np.degrees(np.median(turn))), "translation_m": float(np.median(shift))}
+    figures: dict[str, float | int] = {
+        "rotation_deg": float(np.degrees(np.median(turn))),
+        "translation_m": float(np.median(shift)),
+    }
     return mean, {"frames": int(both.sum()), **figures}
 
 

@@ -124,3 +124,20 @@ def _finite(value: Any) -> Any:
     """Strict JSON: an infinite error of a lost frame has no number."""
     text = json.dumps(value)
     return json.loads(text, parse_constant=lambda _: None)
+
+
+def summary(documents: Sequence[dict[str, Any]]) -> str:
+    """A line per session: its best row's scores, or why it failed."""
+    titles = ["session", "variant", "tosses", "lost", *(title for _, title in COLUMNS)]
+    lines = ["| " + " | ".join(titles) + " |", "|---|---|" + "---:|" * (len(titles) - 2)]
+    failed = []
+    for document in documents:
+        rows = [r for r in document.get("rows", []) if r["scope"] == "all"] or document.get("rows", [])
+        if not rows:
+            failed.append(f"{document['session']}: {document.get('error', 'no result')}")
+            continue
+        row = next((r for r in rows if r["variant"] == "ours"), rows[-1])
+        cells = [str(document["session"]), row["variant"], str(len(row["tosses"]))]
+        cells += [str(sum(t["lost"] for t in row["per_toss"])), *(_cell({**row, "paper": None}, n) for n, _ in COLUMNS)]
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join([*lines, *([""] if failed else []), *failed])

@@ -239,10 +239,11 @@ def test_a_single_mcap_file_is_processed(
 def test_of_several_sessions_one_that_fails_does_not_stop_the_others(
     record_tiny: Record, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    good, missing = record_tiny("good", tosses=(0,)), tmp_path / "missing"
-    code, out, _ = answers(capsys, missing, good, "--out", tmp_path / "out")
+    good, missing = record_tiny("good", tosses=(0,), frames=5), tmp_path / "missing"
+    code, out, _ = answers(capsys, missing, good, "--out", tmp_path / "out", "--tracker", "frame-to-model")
     assert code == 2
     assert "missing does not exist" in out
+    assert "| good | bundlesdf-1 | 1 | 0 |" in out
     assert Results.open(tmp_path / "out" / "good").variants()
 
 
@@ -255,7 +256,7 @@ def test_of_several_sessions_one_that_fails_does_not_stop_the_others(
         (["--toss", "7"], "the session has the tosses 0, 1"),
         (["--toss", "1-"], "wanted a toss number or a range"),
         (["--scope", "both"], "invalid choice: 'both'"),
-        (["--truth", "nowhere"], "nowhere is no truth: wanted toss_XX.mcap"),
+        (["--truth", "nowhere"], "nowhere is no truth: wanted a folder"),
         (["--device", "cuda"], "no CUDA device here"),
     ],
 )

@@ -1,0 +1,198 @@
+"""The cycle: what moves shapes between frames, what a second pass is given, what counts as better, and its rows."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+
+from processing.cli import config_of, main
+from processing.cycle import placement
+from processing.field.learn import LearnConfig
+from processing.field.train import FieldConfig
+from processing.icp import IcpConfig, ShapeSurface, align_frame
+from processing.judge import JudgeConfig, explain
+from processing.reproject import RaycastRenderer
+from processing.reprojected import RedrawConfig, SecondFrames, redraw
+from recordings.geometry import rotation_exp
+from recordings.results import Results
+from recordings.tracks import ObjectShape, ObjectTrack
+
+BOX_M = (0.10, 0.08, 0.06)
+
+
+def box_shape() -> ObjectShape:
+    box = trimesh.creation.box(BOX_M).subdivide().subdivide()
+    grey = np.full((len(box.vertices), 3), 128, dtype=np.uint8)
+    return ObjectShape("object", "test", np.asarray(box.vertices), np.asarray(box.faces), grey)
+
+
+def track_of(poses: np.ndarray, frame: str = "object") -> ObjectTrack:
+    n = len(poses)
+    status: Any = tuple("tracked" if np.isfinite(p).all() else "lost" for p in poses)
+    times_ns = np.arange(n) * 33_333_333
+    return ObjectTrack(0, "d455", frame, times_ns, poses, status, np.full((n, 6, 6), np.nan))
+
+
+def motion(turn: tuple[float, float, float], shift: tuple[float, float, float]) -> np.ndarray:
+    out = np.eye(4)
+    out[:3, :3], out[:3, 3] = rotation_exp(np.array(turn, dtype=np.float64)), shift
+    return out
+
+
+def test_two_tracks_of_one_motion_give_the_motion_between_their_frames_despite_a_bad_frame() -> None:
+    rng = np.random.default_rng(2)
+    shared = np.stack([motion(tuple(rng.normal(0, 1, 3)), tuple(rng.normal(0, 0.1, 3))) for _ in range(12)])
+    own_from_shared = motion((0.3, -0.2, 0.9), (0.02, 0.01, -0.03))
+    own = shared @ np.linalg.inv(own_from_shared)
+    own[4] = own[4] @ motion((0.5, 0, 0), (0.05, 0, 0))
+    own[7] = np.nan
+    found, residual = placement(track_of(own), track_of(shared))
+    np.testing.assert_allclose(found, own_from_shared, atol=1e-9)
+    assert residual["frames"] == 11
+    assert residual["rotation_deg"] < 1e-5
+
+
+def test_a_drawn_frame_keeps_the_cameras_depth_where_it_agrees_and_fills_the_rest(tiny_world: Any) -> None:
+    pose = tiny_world.poses(3)[1]
+    frame, mask = tiny_world.see(pose, 1)
+    camera_from_object = (tiny_world.world_from_camera.inverse() @ pose).matrix
+    holes = frame.depth_m.copy()
+    inside = np.argwhere(mask)[::7]
+    holes[inside[:, 0], inside[:, 1]] = 0
+    raw = replace(frame, depth_m=holes)
+    renderer = RaycastRenderer(box_shape(), tiny_world.camera)
+    drawn = redraw(raw, mask, camera_from_object, renderer, RedrawConfig("filled"))
+    kept = mask & (holes > 0) & drawn.mask
+    assert (drawn.frame.depth_m[kept] == holes[kept]).mean() > 0.98
+    filled = mask & (holes == 0) & drawn.mask
+    np.testing.assert_allclose(drawn.frame.depth_m[filled], frame.depth_m[filled], atol=0.002)
+    papers = redraw(raw, mask, camera_from_object, renderer, RedrawConfig("rendered"))
+    assert (papers.frame.depth_m[drawn.mask] == renderer.depth(camera_from_object)[drawn.mask]).all()
+
+
+def test_what_a_hand_hides_is_filled_without_colour_or_cut_out(tiny_world: Any) -> None:
+    pose = tiny_world.poses(3)[1]
+    frame, mask = tiny_world.see(pose, 1, hand=True)
+    camera_from_object = (tiny_world.world_from_camera.inverse() @ pose).matrix
+    renderer = RaycastRenderer(box_shape(), tiny_world.camera)
+    whole = renderer.depth(camera_from_object) > 0
+    hidden = whole & ~mask
+    assert hidden.sum() > 30
+    filled = redraw(frame, mask, camera_from_object, renderer, RedrawConfig())
+    assert (filled.mask == whole).all()
+    assert filled.colorless[hidden].all()
+    cut = redraw(frame, mask, camera_from_object, renderer, RedrawConfig(occlusion="subtract"))
+    assert (cut.mask & hidden).sum() < 0.1 * hidden.sum()
+
+
+def test_a_frame_without_a_pose_is_given_to_the_second_pass_as_it_was_taken(tiny_world: Any) -> None:
+    frame, mask = tiny_world.see(tiny_world.poses(3)[1], 1)
+    renderer = RaycastRenderer(box_shape(), tiny_world.camera)
+    seen = SecondFrames([frame], np.array([0]), [mask], np.full((1, 4, 4), np.nan), renderer, RedrawConfig())
+    assert (seen[0].depth_m == frame.depth_m).all()
+    assert (seen.masks[0] == mask).all()
+    assert not seen.colorless[0].any()
+
+
+@pytest.mark.parametrize("error", [motion((0.05, 0, 0), (0, 0, 0)), motion((0, 0, 0), (0.004, 0, 0.003))])
+def test_a_worse_pose_explains_the_raw_images_worse(tiny_world: Any, error: np.ndarray) -> None:
+    world_poses = tiny_world.poses(4)
+    seen = [tiny_world.see(p, i) for i, p in enumerate(world_poses)]
+    poses = np.stack([(tiny_world.world_from_camera.inverse() @ p).matrix for p in world_poses])
+    frames, masks = [f for f, _ in seen], [m for _, m in seen]
+    true, wrong = (
+        explain(box_shape(), track_of(p), frames, masks, tiny_world.camera, JudgeConfig(every=1)).evidence()
+        for p in (poses, poses @ error)
+    )
+    assert true.frames == wrong.frames == 4
+    assert true.depth_m < 0.6 * wrong.depth_m
+    assert true.mask < wrong.mask
+
+
+def test_a_lost_frame_counts_as_lost_and_never_as_explained(tiny_world: Any) -> None:
+    world_poses = tiny_world.poses(4)
+    seen = [tiny_world.see(p, i) for i, p in enumerate(world_poses)]
+    poses = np.stack([(tiny_world.world_from_camera.inverse() @ p).matrix for p in world_poses])
+    poses[2] = np.nan
+    found = explain(
+        box_shape(),
+        track_of(poses),
+        [f for f, _ in seen],
+        [m for _, m in seen],
+        tiny_world.camera,
+        JudgeConfig(every=1),
+    ).evidence()
+    assert (found.frames, found.lost) == (3, 1)
+
+
+def test_what_the_track_knows_well_and_depth_badly_stays_with_the_track() -> None:
+    surface = ShapeSurface(box_shape())
+    rng = np.random.default_rng(0)
+    face = np.c_[rng.uniform(-0.05, 0.05, 600), rng.uniform(-0.04, 0.04, 600), np.full(600, -0.03)]
+    pose = motion((0, 0, 0), (0, 0, 0.6))
+    points = face + [0.006, 0, 0.6 + 0.004]  # moved along the face, which cannot be seen, and away, which can
+    points += rng.normal(0, 0.0005, points.shape)
+    free = align_frame(surface, points, pose, IcpConfig(least_fitness=0.3)).camera_from_object
+    tight = np.diag([1e-4, 1e-4, 1e-4, 1e-4, 1e-4, 1e-4]) ** 2
+    held = align_frame(surface, points, pose, IcpConfig(least_fitness=0.3), tight).camera_from_object
+    assert free[2, 3] == pytest.approx(0.604, abs=5e-4)
+    assert abs(held[2, 3] - 0.6) < 0.5 * abs(free[2, 3] - 0.6)
+    assert np.abs(held[:2, 3]).max() < 1e-3
+
+
+@pytest.fixture(scope="module")
+def whole_table(tiny_world: Any, tmp_path_factory: pytest.TempPathFactory) -> Results:
+    """Every row in both scopes on a tiny session without a toss in it: contact finds nothing to learn from."""
+    folder = tmp_path_factory.mktemp("table")
+    session = tiny_world.record(folder / "tiny", frames=6)
+    few = LearnConfig(field=FieldConfig(steps=10, rays=256, pose_rounds=0))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("processing.cli.config_of", lambda args: replace(config_of(args), shape=few))
+        truth = tiny_world.truth_folder(folder / "tiny_truth", frames=6)
+        code = main([str(session), "--variant", "table", "--out", str(folder / "out"), "--truth", str(truth)])
+    assert code == 0
+    return Results.open(folder / "out")
+
+
+def test_the_table_holds_every_row_of_both_scopes(whole_table: Results) -> None:
+    document = json.loads((whole_table.path / "table.json").read_text())
+    rows = {(r["variant"], r["scope"]) for r in document["rows"]}
+    paper = ("bundlesdf-1", "bundlesdf-10", "no-cycle", "no-contact", "no-icp", "ours")
+    assert rows == {*((v, s) for v in paper for s in ("one", "all")), ("converged", "all"), ("joint", "all")}
+    assert all(r["values"]["add_auc"]["value"] > 80 for r in document["rows"])
+
+
+@pytest.mark.parametrize(("scope", "vision"), [("one", "bundlesdf-1"), ("all", "bundlesdf-10")])
+def test_contact_without_the_cycle_leaves_the_poses_as_vision_had_them(
+    whole_table: Results, scope: str, vision: str
+) -> None:
+    tracks = [[t.track for t in whole_table.find(name, scope).tosses] for name in ("no-cycle", vision)]
+    assert tracks[0] == tracks[1]
+
+
+def test_rows_share_their_stages(whole_table: Results) -> None:
+    stages = [p.name.split("-")[0] for p in whole_table.path.iterdir() if (p / "stage.json").exists()]
+    assert stages.count("segment") == 2
+    assert stages.count("scene") == 1
+    first_passes = {t.track for t in whole_table.find("bundlesdf-1", "one").tosses}
+    assert len(first_passes) == 2
+
+
+def test_what_contact_could_not_learn_is_said_and_the_rest_is_delivered(whole_table: Results) -> None:
+    notes = whole_table.find("ours", "all").notes
+    assert any("contact learning was kept out" in n for n in notes)
+    assert len(whole_table.shape("ours", "all").faces) > 100
+    page = (whole_table.path / "report.html").read_text()
+    assert "kept out" in page
+    assert page.count("data:image/") >= 3
+
+
+def test_the_second_pass_says_what_it_changed(whole_table: Results) -> None:
+    passes = whole_table.find("ours", "all").extra["passes"]
+    assert passes[0]["before"]["frames"] == passes[0]["after"]["frames"] > 0
+    assert passes[0]["rotation_deg"] >= 0
