@@ -9,7 +9,7 @@ being free within what the arm is known for.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -17,7 +17,6 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray as Array
 from scipy.linalg import sqrtm
-from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from calibration.extrinsics import LEAST_POINTS, board_pose, whitening
@@ -37,11 +36,13 @@ GOOD_DEG, WORST_DEG = 0.3, 1.0
 GOOD_PX, WORST_PX = 0.5, 3.0
 FOLDS = 4
 HUBER = 2.5
+STEPS = 30
+DIFFERENCE, POSE_DIFFERENCE = 1e-7, 1e-4
 
 
 @dataclass(frozen=True)
 class ArmAccuracy:
-    """How well the arm knows its tool's pose, in the tool's frame (standard deviations): a first guess, the data decide."""
+    """How well the arm knows its tool's pose, in the tool's frame (standard deviations). A guess: the data decide."""
 
     turn_deg: float = 0.05
     shift_m: float = 0.0003
@@ -296,37 +297,52 @@ def _solve(looks: _Looks, start: tuple[Array, Array], arm: ArmAccuracy) -> _Refi
     def residuals(numbers: Array) -> Array:
         return np.concatenate([np.einsum("nij,nj->ni", white, gaps(numbers)).ravel(), numbers[12:]])
 
-    done = least_squares(
-        residuals,
-        np.zeros(12 + 6 * count),
-        jac_sparsity=_pattern(owner, count),
-        loss="huber",
-        f_scale=HUBER,
-        x_scale="jac",
-        max_nfev=40,
-    )
-    X, T, off = split(done.x)
-    J = done.jac.toarray() if hasattr(done.jac, "toarray") else done.jac
-    scale = max(1.0, 2.0 * done.cost / max(1, len(done.fun) - len(done.x)))
+    numbers, J, left = _gauss_newton(residuals, np.zeros(12 + 6 * count), owner)
+    X, T, off = split(numbers)
+    scale = max(1.0, float(left @ left) / max(1, len(left) - len(numbers)))
     covariance = scale * np.linalg.pinv(J.T @ J, hermitian=True)[:6, :6]
     turns, shifts = np.linalg.norm(off[:, :3], axis=1), np.linalg.norm(off[:, 3:], axis=1)
     robot_deg, robot_mm = (float(np.sqrt((v**2).mean())) for v in (np.degrees(turns), 1e3 * shifts))
-    return _Refined(X, T, covariance, -gaps(done.x), robot_deg, robot_mm)
+    return _Refined(X, T, covariance, -gaps(numbers), robot_deg, robot_mm)
 
 
-def _pattern(owner: Array, count: int) -> Array:
-    """Which residual depends on which number: a view on X, T and its own robot pose."""
-    from scipy.sparse import lil_matrix
+def _gauss_newton(residuals: Callable[[Array], Array], numbers: Array, owner: Array) -> tuple[Array, Array, Array]:
+    """Damped Gauss-Newton with Huber's weights: the numbers, the weighted derivatives and residuals there."""
+    damping, best = 1e-6, np.inf
+    weight = J = left = np.zeros(0)
+    trial = numbers
+    for _ in range(STEPS):
+        plain = residuals(trial)
+        weight = np.sqrt(np.minimum(1.0, HUBER / np.maximum(np.abs(plain), 1e-12)))
+        cost = float(np.where(np.abs(plain) <= HUBER, plain**2, HUBER * (2 * np.abs(plain) - HUBER)).sum())
+        if cost < best:
+            gain, best, numbers, damping = best - cost, cost, trial, max(damping / 10, 1e-9)
+            left = weight * plain
+            if gain < 1e-7 * cost:
+                break
+            J = weight[:, None] * _jacobian(residuals, numbers, plain, owner)
+        else:
+            damping *= 10
+        normal = J.T @ J
+        trial = numbers - np.linalg.solve(normal + damping * np.diag(np.diag(normal)), J.T @ left)
+    return numbers, J, left
 
+
+def _jacobian(residuals: Callable[[Array], Array], at: Array, here: Array, owner: Array) -> Array:
+    """By differences. A pose's own numbers move only its own residuals, so all poses are moved at once."""
     rows = np.repeat(owner, 2)
-    pattern = lil_matrix((len(rows) + 6 * count, 12 + 6 * count), dtype=int)
-    pattern[: len(rows), :12] = 1
-    for k in range(count):
-        mine = np.flatnonzero(rows == k)
-        pattern[mine[:, None], 12 + 6 * k + np.arange(6)] = 1
-    for k in range(6 * count):
-        pattern[len(rows) + k, 12 + k] = 1
-    return pattern
+    count = (len(at) - 12) // 6
+    out = np.zeros((len(here), len(at)))
+    for k in range(12):
+        out[:, k] = (residuals(at + DIFFERENCE * np.eye(len(at))[k]) - here) / DIFFERENCE
+    for k in range(6):
+        ahead = at.copy()
+        ahead[12 + k :: 6] += POSE_DIFFERENCE
+        change = (residuals(ahead) - here) / POSE_DIFFERENCE
+        out[np.arange(len(rows)), 12 + k + 6 * rows] = change[: len(rows)]
+        own = np.arange(count) * 6 + k
+        out[len(rows) + own, 12 + own] = change[len(rows) + own]
+    return out
 
 
 def _hold_out(looks: _Looks, start: tuple[Array, Array], arm: ArmAccuracy) -> dict[str, float]:
