@@ -20,7 +20,7 @@ from processing.contact.geometry import SCALE_M, FreePoints, hull_mesh
 from processing.contact.inertia import Physics, uniform_physics
 from processing.contact.judge import losses_of, mean_loss_j, series_of, usable
 from processing.contact.learn import ContactConfig, ContactLearning, Plane, learn_contact, results_of
-from processing.contact.loss import REFERENCE_MASS_KG, contact_loss, find_contacts
+from processing.contact.loss import REFERENCE_MASS_KG, contact_loss, find_contacts, point_velocity
 from processing.contact.motion import GRAVITY_M_S2
 from processing.contact.prior import Prior
 from processing.contact.result import result_document, warnings_of
@@ -31,6 +31,8 @@ from recordings.tracks import ContactModel, ObjectShape, ObjectTrack
 
 REACH = 0.15
 """Neighbourhood of a touched point in which the prior is compared with it, as a share of the mean extent."""
+BLUR = 0.1
+"""What a touch reads is blurred by this share of the point's way between two frames: the impact was somewhere on it."""
 NEAR_M = 0.005
 """A point this near to the plane may read the surface."""
 
@@ -156,15 +158,16 @@ def readings_of(learning: ContactLearning, prior: Prior) -> Readings:
     impulses = contact_loss(data, body, contacts, learning.weights).impulses
     found = find_contacts(data.rotation, data.position_m, body, contacts)
     least = 0.05 * REFERENCE_MASS_KG * GRAVITY_M_S2 * data.step_s[impulses.rows]
-    strength = impulses.impulse[..., 2]
-    touch = (strength > least[:, None]) & (found.height_m[impulses.rows].abs() < NEAR_M)
+    touch = (impulses.impulse[..., 2] > least[:, None]) & (found.height_m[impulses.rows].abs() < NEAR_M)
     touch &= (data.weight[impulses.rows] > 0)[:, None]
     row, column = touch.nonzero().cpu().numpy().T
     rows = impulses.rows.cpu().numpy()[row]
     point = found.index.cpu().numpy()[rows, column]
     down = -data.rotation.cpu().numpy()[rows, 2]
-    kept = thinned(point, down, strength.cpu().numpy()[row, column])
-    return _compared(learning, prior, body.points_m.cpu().numpy(), point[kept], down[kept])
+    moved = point_velocity(data.rotation, found.arm_m, data.spin, data.velocity).norm(dim=-1)
+    blur = BLUR * (moved * data.step_s[:, None]).cpu().numpy()[rows, column]
+    kept = thinned(point, down, -blur)
+    return _compared(learning, prior, body.points_m.cpu().numpy(), point[kept], down[kept], blur[kept])
 
 
 def _compared(
@@ -173,6 +176,7 @@ def _compared(
     points: Float[Array, "v 3"],
     touched: Int[Array, " j"],
     direction: Float[Array, "j 3"],
+    blur_m: Float[Array, " j"],
 ) -> Readings:
     """Learned against prior support near the touched points, along the directions they were touched in."""
     start = start_points(prior)
@@ -186,7 +190,7 @@ def _compared(
         width = np.broadcast_to(0.5 * learning.spread.extents_m, (len(touched), 3))
     else:
         width = learning.spread.points_m[touched]
-    sigma = np.sqrt(((direction * width) ** 2).sum(1)) / 1.96
+    sigma = np.sqrt(((direction * width / 1.96) ** 2).sum(1) + blur_m**2)
     axes = prior.frame.axes
     return Readings(prior.frame.back(at), direction @ axes.T, further, sigma)
 

@@ -152,7 +152,7 @@ def likely_sizes(readings: Readings, surface: Surface, config: FusionConfig, pla
 def thinned(
     point: Int[Array, " j"], direction: Float[Array, "j 3"], weight: Float[Array, " j"], most: int = 240
 ) -> Int[Array, " k"]:
-    """Readings worth keeping: of each point, directions at least 10 degrees apart, those of the strongest impulses."""
+    """Readings worth keeping: of each point, directions at least 10 degrees apart, the weightiest ones."""
     kept: list[int] = []
     for i in np.argsort(-weight):
         same = [k for k in kept if point[k] == point[i]]
