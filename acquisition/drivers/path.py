@@ -22,11 +22,11 @@ def along(path: Float[Array, "n j"], place: float) -> Float[Array, " j"]:
 
 def from_here(path: Float[Array, "n j"], here: Float[Array, " j"], rate_hz: float) -> Float[Array, "n j"]:
     """The path begun at `here` instead of its first sample; the difference fades out within BLEND_S."""
-    left = 1 - rise(np.arange(len(path)) / (rate_hz * BLEND_S))
+    left = 1 - np.asarray(rise(np.arange(len(path)) / (rate_hz * BLEND_S)))
     return path + left[:, None] * (here - path[0])
 
 
-def rise(share: Float[Array, " n"] | float) -> Float[Array, " n"]:
+def rise(share: Float[Array, " *n"] | float) -> Float[Array, " *n"] | float:
     """The minimum-jerk step from 0 to 1, over shares 0 to 1."""
     u = np.clip(share, 0.0, 1.0)
     return u**3 * (10 - 15 * u + 6 * u**2)
