@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import datetime
 import platform
+import shutil
 import sys
 import time
 from collections.abc import Mapping
+from dataclasses import asdict
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -15,10 +18,12 @@ from typing import Any
 from acquisition.clock import SessionClock
 from acquisition.interrupts import Interrupts
 from acquisition.operator import Keyboard, Nobody, Operator, single_keys
+from acquisition.preflight import Preflight, preflight
 from acquisition.recorder import Recorder
 from acquisition.rig import Rig
 from acquisition.run import Options, SessionReport, SessionRun
 from acquisition.setup import Setup, set_up
+from acquisition.throw import Thrower
 from recordings.console import DONE, FELL_SHORT, Outcome, progress_for
 from recordings.errors import BadInput
 from recordings.session_resume import next_toss, resume_session
@@ -30,39 +35,139 @@ RESUMED_AFTER_NS = 10_000_000_000
 
 def run(args: argparse.Namespace) -> Outcome:
     """Everything between the arguments and the exit code."""
+    if args.doctor:
+        return _doctor(args.out or Path())
     if args.tosses < 1:
         raise BadInput(f"--tosses {args.tosses}; wanted 1 or more")
     setup = set_up(args.rig)
+    operator: Operator = Nobody() if args.yes else Keyboard()
+    if args.dry_run:
+        return _dry_run(setup, args.tosses, operator)
     out = args.out if args.out is not None else new_folder(setup.rig, args.object)
     check_folder(out, args.resume)
-    operator: Operator = Nobody() if args.yes else Keyboard()
+    check_room(out, setup.rig.recording.reserve_gb)
     with Interrupts() as interrupts, single_keys(sys.stdin):
-        report = _record(args, setup, out, operator, interrupts)
-    if setup.lab is not None:
+        report, checks = _record(args, setup, out, operator, interrupts)
+    if setup.lab is not None and report.takes:
         from acquisition.synthetic.beside import write_beside
 
         write_beside(setup.lab, out)
-    return outcome(report)
+    return outcome(report, checks)
 
 
 def _record(
     args: argparse.Namespace, setup: Setup, out: Path, operator: Operator, interrupts: Interrupts
-) -> SessionReport:
-    first = next_toss(out) if args.resume and out.exists() else 0
-    setup.thrower.prepare(first, 0, progress_for("preparing the simulated lab"))
+) -> tuple[SessionReport, Preflight]:
+    first = next_toss(out) if args.resume else 0
     clock = new_clock(out)
     recorder = Recorder(setup.rig, setup.devices, clock)
-    with recorder:
+    with contextlib.ExitStack() as open_things:
+        if setup.lab is not None:
+            setup.thrower.prepare(first, 0, progress_for("preparing the simulated lab"))
+        open_things.enter_context(recorder)
+        if args.preview:
+            open_things.enter_context(_preview(recorder))
         time.sleep(WARM_UP_S)
-        session = open_session(out, start_document(args, setup, clock, recorder), setup, args.resume, operator)
-        with session:
+        checks = preflight(recorder, setup.calibration, out)
+        operator.say(checks.text())
+        _go_on(checks, operator)
+        thrower = make_thrower(setup, recorder, operator)
+        start = start_document(args, setup, clock, recorder, checks)
+        with interrupts.shield():
+            session = open_things.enter_context(open_session(out, start, setup, args.resume, operator))
+        if args.calibration:
+            from acquisition.views import record_views
+
+            report = record_views(recorder, session, setup, args.calibration, operator, interrupts)
+        else:
             session_run = SessionRun(
-                recorder, setup.thrower, session, setup.calibration, operator, progress_for("preparing"), interrupts
+                recorder, thrower, session, setup.calibration, operator, progress_for("preparing"), interrupts
             )
             report = session_run.record(Options(args.tosses, first))
-            with interrupts.shield():
-                session.finish("complete" if not report.stopped else "stopped", report.stopped)
-    return report
+        with interrupts.shield():
+            session.finish("complete" if not report.stopped else "stopped", report.stopped)
+    return report, checks
+
+
+def _doctor(folder: Path) -> Outcome:
+    from acquisition.doctor import doctor
+
+    found = doctor(folder)
+    rows = [asdict(row) for row in found.rows]
+    return Outcome({"rows": rows}, found.text(), FELL_SHORT if found.failed else DONE)
+
+
+def _dry_run(setup: Setup, tosses: int, operator: Operator) -> Outcome:
+    """Plans only: what would be tossed, and how near to the limits."""
+    thrower = make_thrower(setup, None, operator)
+    planned = []
+    for toss in range(tosses):
+        plan = thrower.plan(toss) if hasattr(thrower, "plan") else None
+        if plan is None:
+            raise BadInput(f"rig '{setup.rig.name}' plans no tosses: its tosses are made by hand")
+        planned.append(
+            {
+                "toss": toss,
+                "seconds": plan.trajectory.duration_s,
+                "release_s": plan.release_s,
+                "command_s": plan.command_s,
+                "window_s": plan.window_s,
+                "position_m": plan.world_from_tool.translation_m.tolist(),
+                "velocity_m_s": plan.linear_velocity_world_m_s.tolist(),
+                "spin_rad_s": plan.angular_velocity_world_rad_s.tolist(),
+            }
+        )
+    lines = [
+        f"{toss_name(p['toss'])}  {p['seconds']:.2f} s, release at {p['release_s']:.3f} s "
+        f"(told at {p['command_s']:.3f} s), window {1e3 * p['window_s']:.0f} ms, velocity "
+        + " ".join(f"{v:+.2f}" for v in p["velocity_m_s"])
+        + " m/s"
+        for p in planned
+    ]
+    return Outcome({"tosses": planned}, "\n".join([*lines, "nothing moved, nothing was written"]))
+
+
+def make_thrower(setup: Setup, recorder: Recorder | None, operator: Operator) -> Thrower:
+    """The simulated lab's own, the arm of a rig with [toss], or a person's hand."""
+    rig = setup.rig
+    if setup.lab is not None or rig.toss is None or rig.robot is None or not rig.of_kind("arm"):
+        return setup.thrower
+    from acquisition.arm_thrower import ArmThrower, base_in_world
+    from acquisition.toss_limits import arm_model
+
+    base = base_in_world(rig.toss, setup.calibration)
+    return ArmThrower(arm_model(rig.robot), base, rig.toss, recorder, operator)
+
+
+def _preview(recorder: Recorder) -> contextlib.AbstractContextManager[object]:
+    from acquisition.preview import Preview
+
+    return Preview(recorder)
+
+
+def _go_on(checks: Preflight, operator: Operator) -> None:
+    """A failed check stops a run that nobody watches; a person may go on."""
+    if not checks.failed:
+        return
+    said = "; ".join(f"{r.check} {r.subject}: {r.found}" for r in checks.failed)
+    if operator.headless:
+        raise BadInput(f"the preflight failed ({said}); nothing was written. Mend it, or run without --yes to decide")
+    operator.say("the preflight failed. s: record all the same   q: quit")
+    if operator.wait_for_start() == "quit":
+        raise BadInput(f"the preflight failed ({said}); nothing was written")
+
+
+def check_room(out: Path, reserve_gb: float) -> None:
+    """Raises BadInput for a disk that is full before anything is opened."""
+    place = out
+    while not place.exists():
+        place = place.parent
+    free = shutil.disk_usage(place).free
+    if free < reserve_gb * 1e9:
+        raise BadInput(
+            f"{place} has {free / 1e9:.2f} GB free, less than the reserve of {reserve_gb:g} GB; nothing was written. "
+            "Free some space or choose another folder"
+        )
 
 
 def new_folder(rig: Rig, object_name: str) -> Path:
@@ -112,7 +217,9 @@ def open_session(out: Path, start: Mapping[str, Any], setup: Setup, resume: bool
     return session
 
 
-def start_document(args: argparse.Namespace, setup: Setup, clock: SessionClock, recorder: Recorder) -> dict[str, Any]:
+def start_document(
+    args: argparse.Namespace, setup: Setup, clock: SessionClock, recorder: Recorder, checks: Preflight
+) -> dict[str, Any]:
     """Who, what, with which devices and settings, and the one reading of the wall clock."""
     rig = setup.rig
     described = {name: device.describe() for name, device in recorder.devices.items()}
@@ -129,6 +236,7 @@ def start_document(args: argparse.Namespace, setup: Setup, clock: SessionClock, 
             "arm": {"panda": "franka_panda", "ur5e": "ur5e"}.get(rig.robot or ""),
             "devices": described,
         },
+        "preflight": [asdict(row) for row in checks.rows],
         "versions": {
             "tosslab": metadata.version("tosslab"),
             "python": platform.python_version(),
@@ -137,13 +245,14 @@ def start_document(args: argparse.Namespace, setup: Setup, clock: SessionClock, 
     }
 
 
-def outcome(report: SessionReport) -> Outcome:
+def outcome(report: SessionReport, checks: Preflight) -> Outcome:
     """What the command says at its end."""
     document = {
         "session": str(report.folder),
         "asked": report.asked,
         "accepted": report.accepted,
         "stopped": report.stopped,
+        "preflight": [asdict(row) for row in checks.rows],
         "tosses": [
             {
                 "toss": t.toss,

@@ -34,6 +34,8 @@ LINK_M = 0.06
 """Object points hang together within this."""
 FEWEST_POINTS = 6
 LEFT_PARABOLA_M = 0.02
+FEWEST_FALLING, FALLS_WITHIN_M = 6, 0.01
+"""Six frames at 30 Hz fall 3 cm off a straight line: more than this tolerance forgives."""
 STILL_M = 0.0025
 STILL_FOR_S = 0.25
 OPENED_M = 0.002
@@ -174,8 +176,12 @@ def _distance_to_segment(
 
 @dataclass
 class TossWatcher:
-    """Follows one toss. Feed it in time order; `over` says that the object has come to rest."""
+    """Follows one toss. Feed it in time order; `over` says that the object has come to rest.
 
+    `by_hand`: no gripper tells of the release, so it is where a free fall begins.
+    """
+
+    by_hand: bool = False
     glimpses: list[Glimpse] = field(default_factory=list)
     widths: list[tuple[float, float]] = field(default_factory=list)
 
@@ -208,7 +214,7 @@ class TossWatcher:
         """Whether the object has been still for a while after it was released."""
         released = self.released
         since_s = released.time_s if released is not None else None
-        if since_s is None:
+        if self.by_hand:
             since_s = flight_start_s(self.glimpses)
         if since_s is None or not self.glimpses or self.glimpses[-1].time_s < since_s + 0.2:
             return False
@@ -217,7 +223,7 @@ class TossWatcher:
 
     def events(self) -> TossEvents:
         """Release, first impact and rest, as far as they show in what was seen."""
-        return find_events(self.glimpses, self.released)
+        return find_events(self.glimpses, self.released, self.by_hand)
 
 
 def release_from_widths(widths: Float[Array, "n 2"]) -> Moment | None:
@@ -242,25 +248,25 @@ def release_from_widths(widths: Float[Array, "n 2"]) -> Moment | None:
 
 
 def flight_start_s(glimpses: Sequence[Glimpse]) -> float | None:
-    """When a free fall begins that lasts at least four frames (tosses by hand)."""
+    """When a free fall begins (tosses by hand)."""
     run = _longest_flight(glimpses)
     return None if run is None else glimpses[run[0]].time_s
 
 
 def _longest_flight(glimpses: Sequence[Glimpse]) -> tuple[int, int] | None:
     """First and last glimpse of the longest stretch that falls as a stone does."""
-    if len(glimpses) < 4:
+    if len(glimpses) < FEWEST_FALLING:
         return None
     t = np.array([g.time_s for g in glimpses])
     p = np.array([g.middle_m for g in glimpses])
     best: tuple[int, int] | None = None
-    for first in range(len(t) - 3):
-        last = first + 3
-        while (
-            last < len(t) and t[last] - t[first] < LONGEST_FLIGHT_S and _falls(t[first : last + 1], p[first : last + 1])
-        ):
+    for first in range(len(t) - FEWEST_FALLING + 1):
+        last = first + FEWEST_FALLING - 1
+        while last < len(t) and t[last] - t[first] < LONGEST_FLIGHT_S:
+            if not _falls(t[first : last + 1], p[first : last + 1]):
+                break
             last += 1
-        if last - first > 3 and (best is None or last - 1 - first > best[1] - best[0]):
+        if last - first >= FEWEST_FALLING and (best is None or last - 1 - first > best[1] - best[0]):
             best = (first, last - 1)
     return best
 
@@ -272,7 +278,7 @@ def _falls(t: Float[Array, " n"], p: Float[Array, "n 3"]) -> bool:
     design = np.stack([np.ones_like(s), s], 1)
     left = free - design @ np.linalg.lstsq(design, free, rcond=None)[0]
     moved = np.linalg.norm(p[-1] - p[0]) > 0.04
-    return bool(np.sqrt((left**2).sum(axis=1)).max() < 0.015 and moved)
+    return bool(np.sqrt((left**2).sum(axis=1)).max() < FALLS_WITHIN_M and moved)
 
 
 def still_since_s(glimpses: Sequence[Glimpse]) -> float | None:
@@ -282,16 +288,16 @@ def still_since_s(glimpses: Sequence[Glimpse]) -> float | None:
     p = np.array([g.middle_m for g in glimpses])
     end = np.median(p[-6:], axis=0)
     noise_m = float(np.median(np.linalg.norm(p[-6:] - end, axis=1)))
-    away = np.linalg.norm(p - end, axis=1) > max(2 * STILL_M, 3.5 * noise_m)
+    away = np.linalg.norm(p - end, axis=1) > np.clip(3.5 * noise_m, 2 * STILL_M, 5 * STILL_M)
     last = int(np.flatnonzero(away)[-1]) if away.any() else -1
     if last + 1 >= len(glimpses) - 1:
         return None
     return glimpses[last + 1].time_s
 
 
-def find_events(glimpses: Sequence[Glimpse], released: Moment | None) -> TossEvents:
+def find_events(glimpses: Sequence[Glimpse], released: Moment | None, by_hand: bool = False) -> TossEvents:
     """Everything that the glimpses of a toss tell."""
-    flight = _flight_after(glimpses, released)
+    flight = _flight_after(glimpses, released) if released is not None or by_hand else None
     if flight is None:
         return TossEvents(released)
     first, last = flight

@@ -78,7 +78,7 @@ class Recorder:
         self.looks: deque[Look] = deque(maxlen=600)
         self.arm_tail: deque[ArmSamples] = deque(maxlen=2000)
         self.widths: deque[GripperSample] = deque(maxlen=4000)
-        self.latest: dict[str, Array] = {}
+        self.latest: dict[str, Image] = {}
         self._troubles: deque[Trouble] = deque(maxlen=1000)
         self._mappers: dict[tuple[str, str], ClockMapper] = {}
         self._leads: dict[tuple[str, str], str] = {}
@@ -221,7 +221,7 @@ class Recorder:
         item = Item((image, unit_m), image.host_ns)
         if image.stamp.instant != "arrival":
             item = self._clocked(key, topic, image, unit_m)
-        self.latest[topic] = image.pixels
+        self.latest[topic] = image
         if unit_m is not None and image.stream == "depth":
             stride = look_stride(image.pixels.shape[1])
             small = np.ascontiguousarray(image.pixels[::stride, ::stride])

@@ -111,7 +111,7 @@ class SessionRun:
                 break
             take = self._take(toss, plan, options.fixed_s)
             report.takes.append(take)
-            self.operator.say(f"{toss_name(toss)}: {take.decision}, {take.verdict.text()}")
+            self.operator.say(f"{toss_name(toss)}: {take.decision} ({take.verdict.text()})")
             stop = next((t for t in take.verdict.reasons if "emergency stop" in t), "")
             if take.decision == "accept":
                 toss, attempt = toss + 1, 0
@@ -171,7 +171,10 @@ class SessionRun:
         try:
             self._write_story(writer, take, events, troubles, verdict)
             writer.finish()
-            self.session.add_info(toss, self._info(verdict, take, ended_by))
+            info = self._info(verdict, take, ended_by)
+            self.session.add_info(toss, info)
+            if "release_delay_s" in info["gripper"]:
+                self.thrower.learn(info["gripper"]["release_delay_s"])
         except WriteFailed as refused:
             return Verdict("reject", (str(refused),)), "reject"
         return verdict, "accept"
@@ -256,7 +259,7 @@ class _Running:
 
     def __init__(self, run: SessionRun, plan: TossPlan | None, fixed_s: float | None) -> None:
         self._run, self._plan, self._fixed_s = run, plan, fixed_s
-        self.watcher = TossWatcher()
+        self.watcher = TossWatcher(by_hand=not run.recorder.rig.of_kind("gripper"))
         self.troubles: list[Trouble] = []
         self.notes: list[TossEvent] = []
         self.began_s = time.monotonic()
@@ -420,14 +423,14 @@ def expected_bytes_s(recorder: Recorder) -> float:
     total = 0.0
     lossless = recorder.rig.recording.mono_encoding == "lossless"
     for topic, lane in recorder.lanes.items():
-        pixels = recorder.latest.get(topic)
-        if pixels is None:
+        image = recorder.latest.get(topic)
+        if image is None:
             total += ARM_BYTES_S if "arm" in topic else 0
             continue
         share = DEPTH_SHARE if topic.endswith("depth") else JPEG_SHARE
         if lossless and topic.endswith("/image"):
             share = LOSSLESS_SHARE
-        total += pixels.nbytes * share * lane.rate_hz
+        total += image.pixels.nbytes * share * lane.rate_hz
     return total
 
 

@@ -22,12 +22,18 @@ class Thrower(Protocol):
     def prepare(self, toss: int, attempt: int, progress: Progress) -> TossPlan | None:
         """Bring arm and object to the start of the next toss. None: somebody tosses by hand."""
 
+    def learn(self, delay_s: float) -> None:
+        """The release delay of a toss, from its data."""
+
 
 class ByHand:
     """A person tosses."""
 
     def prepare(self, toss: int, attempt: int, progress: Progress) -> TossPlan | None:
         return None
+
+    def learn(self, delay_s: float) -> None:
+        pass
 
 
 class Throw:

@@ -630,3 +630,6 @@ class SyntheticThrower:
             self._lab.stage.set_up(self._lab.show.perform(number, plan, progress))
             self._ready = number, plan
         return self._ready[1]
+
+    def learn(self, delay_s: float) -> None:
+        pass

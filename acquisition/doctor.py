@@ -1,0 +1,129 @@
+"""`toss-record --doctor`: what is installed, found and missing on this machine, with the line that helps."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import shutil
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+from acquisition.preflight import Preflight, Row
+
+USBFS = Path("/sys/module/usbcore/parameters/usbfs_memory_mb")
+USBFS_MB = 1000
+UDEV = Path("/etc/udev/rules.d")
+SLOWEST_MB_S = 60.0
+
+
+def doctor(folder: Path) -> Preflight:
+    """All checks; nothing is changed."""
+    rows = [*packages(), *realsense(), *genicam(), *system(), *room(folder), *speed(folder)]
+    return Preflight(tuple(rows))
+
+
+def packages() -> Iterator[Row]:
+    """The clients of the devices, and what plans and shows."""
+    wanted = (
+        ("pyrealsense2", "RealSense cameras", "pip install -e .[rig-realsense]"),
+        ("panda_py", "Franka Panda", "pip install -e .[rig-franka]"),
+        ("rtde_control", "Universal Robots", "pip install -e .[rig-ur]"),
+        ("ruckig", "planning tosses", "pip install -e .[rig-franka]"),
+        ("pinocchio", "torques of planned tosses", "pip install -e .[rig-franka]"),
+        ("pupil_apriltags", "AprilTags", "pip install -e ."),
+        ("rerun", "live preview", "pip install -e ."),
+    )
+    for module, what, fix in wanted:
+        there = importlib.util.find_spec(module) is not None
+        yield Row("package", module, "ok" if there else "warning", what if there else f"not installed: {what}", fix)
+
+
+def realsense() -> Iterator[Row]:
+    """Cameras that librealsense sees, and whether this user may open them."""
+    if importlib.util.find_spec("pyrealsense2") is None:
+        return
+    import pyrealsense2 as rs
+
+    found = [
+        f"{d.get_info(rs.camera_info.name)} serial {d.get_info(rs.camera_info.serial_number)}"
+        for d in rs.context().query_devices()
+    ]
+    for text in found:
+        yield Row("camera", "realsense", "ok", text)
+    if not found:
+        fix = "plug it into USB 3; `lsusb -d 8086:` shows whether the kernel sees it"
+        yield Row("camera", "realsense", "warning", "none found", fix)
+    if not list(UDEV.glob("*realsense*")) and os.geteuid() != 0:
+        rules = "sudo cp 99-realsense-libusb.rules /etc/udev/rules.d/ && sudo udevadm control --reload-rules"
+        yield Row("permission", "realsense", "warning", "no udev rule: only root may open the camera", rules)
+
+
+def genicam() -> Iterator[Row]:
+    """Aravis, and the cameras that it sees."""
+    tool = next((t for t in ("arv-tool-0.8", "arv-tool-0.10") if shutil.which(t)), None)
+    if tool is None:
+        fix = "apt-get install -y aravis-tools gir1.2-aravis-0.8"
+        yield Row("package", "aravis", "warning", "not installed: PointGrey/FLIR and other GenICam cameras", fix)
+        return
+    try:
+        listed = subprocess.run([tool], capture_output=True, text=True, timeout=10, check=False).stdout
+    except subprocess.TimeoutExpired:
+        listed = ""
+    lines = [line for line in listed.splitlines() if line.strip() and "No device" not in line]
+    for line in lines:
+        yield Row("camera", "genicam", "ok", line.strip())
+    if not lines:
+        fix = "camera and computer in one network (GigE), or USB3 with a udev rule for its vendor"
+        yield Row("camera", "genicam", "warning", "none found", fix)
+
+
+def system() -> Iterator[Row]:
+    """Settings of the machine that cost frames."""
+    if USBFS.exists():
+        megabytes = int(USBFS.read_text())
+        state = "ok" if megabytes >= USBFS_MB or megabytes == 0 else "warning"
+        fix = f"echo {USBFS_MB} | sudo tee {USBFS}"
+        yield Row("system", "usbfs memory", state, f"{megabytes} MB", fix)  # type: ignore[arg-type]
+    cores = len(os.sched_getaffinity(0))
+    yield Row("system", "cores", "ok" if cores >= 2 else "warning", str(cores), "two or more")
+    realtime = "PREEMPT_RT" in os.uname().version or "PREEMPT RT" in os.uname().version
+    found = "real-time" if realtime else "not real-time: a Franka's 1 kHz loop may miss cycles"
+    yield Row("system", "kernel", "ok" if realtime else "warning", found, "apt-get install -y linux-image-rt-amd64")
+    governors = {p.read_text().strip() for p in Path("/sys/devices/system/cpu").glob("cpu*/cpufreq/scaling_governor")}
+    if governors and governors != {"performance"}:
+        fix = "sudo cpupower frequency-set -g performance"
+        yield Row("system", "cpu governor", "warning", ", ".join(sorted(governors)), fix)
+
+
+def room(folder: Path) -> Iterator[Row]:
+    place = folder.resolve()
+    while not place.exists():
+        place = place.parent
+    free = shutil.disk_usage(place).free
+    yield Row("disk", str(place), "ok" if free > 20e9 else "warning", f"{free / 1e9:.1f} GB free", "20 GB or more")
+
+
+def speed(folder: Path) -> Iterator[Row]:
+    """Writes 128 MB and removes them."""
+    import time
+
+    place = folder.resolve()
+    while not place.exists():
+        place = place.parent
+    probe = place / f".toss-record-speed-{os.getpid()}"
+    block = os.urandom(1 << 22)
+    try:
+        begun = time.monotonic()
+        with open(probe, "wb") as file:
+            for _ in range(32):
+                file.write(block)
+            file.flush()
+            os.fsync(file.fileno())
+        rate = 128 * 1.048576 / (time.monotonic() - begun)
+        state = "ok" if rate > SLOWEST_MB_S else "warning"
+        yield Row("disk", "speed", state, f"{rate:.0f} MB/s", f"{SLOWEST_MB_S:g} MB/s")  # type: ignore[arg-type]
+    except OSError as refused:
+        yield Row("disk", "speed", "fail", f"cannot write there: {refused.strerror}", "another folder")
+    finally:
+        probe.unlink(missing_ok=True)
