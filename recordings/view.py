@@ -23,6 +23,7 @@ from recordings.view_bodies import log_bodies, log_rig
 from recordings.view_file import PipedFile
 from recordings.view_layers import EVENTS, TIME, Clock, Look, Steps, log_toss
 from recordings.view_scene import Scene, moment_ns, result_bodies, results_scene, session_scene
+from recordings.view_track import log_tracking
 from recordings.view_viewer import Viewer, ViewerFailed, run_rerun
 
 APPLICATION = "tosslab"
@@ -184,6 +185,8 @@ def fill(
         clear(clock.at(start_ns))
         clock.at(start_ns).log(EVENTS, rr.TextLog(f"toss {toss}: recording begins"))
         log_bodies(recording, scene, toss)
+        for body in scene.bodies:
+            log_tracking(clock, scene, body)
         if robot is not None:
             log_arm_motion(recording, scene, robot, toss)
         log_toss(recording, scene, toss, look, steps)
@@ -203,7 +206,7 @@ def flush(recording: rr.RecordingStream) -> None:
 
 def clear(recording: rr.RecordingStream) -> None:
     """Nothing of the toss before is left in the picture when the next one begins."""
-    for entity in ("world/seen_by", "world/cameras", "world/path", "flat", "depth"):
+    for entity in ("world/seen_by", "world/cameras", "world/path", "world/rejected", "model", "flat", "depth"):
         recording.log(entity, rr.Clear(recursive=True))
 
 

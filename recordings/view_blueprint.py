@@ -11,7 +11,8 @@ from numpy import ndarray as Array
 from recordings.view_arm import BASE
 from recordings.view_bodies import BODY, PATH
 from recordings.view_layers import ARM, DEPTH, EVENTS, FRAMES, HEALTH, MOTION, TIME, Clock, image_entity
-from recordings.view_scene import Scene, root_poses
+from recordings.view_scene import Body, Scene, root_poses
+from recordings.view_track import FIGURES, MODEL
 
 ABOUT = "about"
 EYE_FROM_TARGET = np.array([1.0, -0.75, 0.6])
@@ -20,13 +21,16 @@ ELBOW_M = np.array([0.0, 0.0, 0.7])
 HALF_VIEW = 0.55
 """Tangent of the half angle that must hold everything; the eye sees a little more."""
 SLOW = 0.25
+MODEL_EYE = [0.2, -0.25, -0.4]
+"""Where the model is seen from, in the object's frame, which is the camera's when tracking begins."""
+FIGURE_NAMES = {"residual": "Residual (0..1)", "on_surface": "On the surface", "mask_confidence": "Mask confidence"}
 
 
 def blueprint(scene: Scene) -> rrb.Blueprint:
     """The table in 3D on the left; images and plots on the right; time over the first toss, four times slowed down."""
     right = [container for container in (_images(scene), _plots(scene), _words(scene)) if container is not None]
     return rrb.Blueprint(
-        rrb.Horizontal(_space(scene), rrb.Vertical(*right, row_shares=[4, 2, 2][: len(right)]), column_shares=[3, 2]),
+        rrb.Horizontal(_spaces(scene), rrb.Vertical(*right, row_shares=[4, 2, 2][: len(right)]), column_shares=[3, 2]),
         _time_panel(scene),
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
@@ -47,6 +51,21 @@ def _time_panel(scene: Scene) -> rrb.TimePanel:
         loop_mode="selection",
         time_selection=rr.encodings.AbsoluteTimeRange(min=start.astype(int), max=end.astype(int)),
     )
+
+
+def _spaces(scene: Scene) -> rrb.Container:
+    """The table, and in a tab behind it the object's model as it grew, in the object's own frame."""
+    model = [
+        rrb.Spatial3DView(
+            origin=MODEL.format(body.name),
+            name="The object as seen so far",
+            line_grid=rrb.LineGrid3D(visible=False),
+            eye_controls=rrb.EyeControls3D(position=MODEL_EYE, look_target=[0, 0, 0], eye_up=[0, -1, 0]),
+        )
+        for body in scene.bodies
+        if body.shown and body.notes
+    ]
+    return rrb.Tabs(_space(scene), *model, active_tab=0)
 
 
 def _space(scene: Scene) -> rrb.Spatial3DView:
@@ -132,6 +151,9 @@ def _plots(scene: Scene) -> rrb.Container | None:
         if scene.root == "world":
             plots.append((f"{MOTION}/height_m", "Height (m)"))
         plots += [(f"{MOTION}/speed_m_s", "Speed (m/s)"), (f"{MOTION}/spin_rad_s", "Spin (rad/s)")]
+    for name, shown in FIGURE_NAMES.items():
+        if any(has_figure(body, name) for body in scene.bodies):
+            plots.append((f"{FIGURES}/{name}", shown))
     if any("/arm/joint_states" in toss.file.channels for toss in recorded):
         plots += [(f"{ARM}/angles_rad", "Arm joints (rad)"), (f"{ARM}/speeds_rad_s", "Joint speeds (rad/s)")]
         plots.append((f"{ARM}/finger_width_m", "Gripper (m)"))
@@ -140,6 +162,11 @@ def _plots(scene: Scene) -> rrb.Container | None:
     axis = _plotted_range(scene)
     views = [rrb.TimeSeriesView(origin=origin, name=name, axis_x=axis) for origin, name in plots]
     return rrb.Tabs(*views, name="Plots") if views else None
+
+
+def has_figure(body: Body, name: str) -> bool:
+    """Whether this figure of how a body was tracked is known in any toss."""
+    return bool(body.masks if name == "mask_confidence" else body.notes)
 
 
 def _plotted_range(scene: Scene) -> rrb.TimeAxis | None:
@@ -171,6 +198,7 @@ def about_text(scene: Scene) -> str:
     for body in scene.bodies:
         hidden = "" if body.shown else " (hidden: click its eye in the list of entities)"
         lines += [f"- **{_color_word(body.color)}**: {body.label}, and its way through the toss{hidden}."]
+        lines += _tracking_words(body)
     lines += [
         "",
         "Space starts and stops. The blue range of the time line is the first toss; drag it to another.",
@@ -183,6 +211,18 @@ def about_text(scene: Scene) -> str:
     if scene.notes:
         lines += ["", "**Not as complete as it could be**", *(f"- {note}" for note in scene.notes)]
     return "\n".join(lines)
+
+
+def _tracking_words(body: Body) -> list[str]:
+    lines = ["- **Tint over the colour image**: the mask it was tracked in."] if body.masks else []
+    if not body.notes:
+        return lines
+    lines += ["- **Second tab in 3D**: what its keyframes had seen of it so far, arrows from where they look."]
+    if any(len(n.matches.frames) for n in body.notes.values()):
+        lines += ["- **Lines in the colour image**: feature matches with a keyframe; red ones do not fit the poses."]
+    if any(len(n.rejected.frame) for n in body.notes.values()):
+        lines += ["- **Grey axes**: poses that were tried and not taken, with what they cost."]
+    return lines
 
 
 def _count(tosses: int) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,8 +14,9 @@ from numpy import ndarray as Array
 from recordings.errors import BadInput
 from recordings.geometry import Transform
 from recordings.records import StampedPose
-from recordings.results import Results, VariantRecord
+from recordings.results import Masks, Results, VariantRecord, read_masks
 from recordings.session import Session, Toss
+from recordings.track_notes import TrackNotes, find_notes
 from recordings.tracks import ObjectShape, RigCalibration
 
 Color = tuple[int, int, int]
@@ -42,6 +43,10 @@ class Body:
     shapes: Mapping[int, ObjectShape]
     shown: bool = True
     """Whether it is seen at once; the others wait for a click in the viewer's tree."""
+    masks: Mapping[int, Masks] = field(default_factory=dict)
+    """Of each toss, where the body was tracked in masks."""
+    notes: Mapping[int, TrackNotes] = field(default_factory=dict)
+    """How it was tracked, where the tracker kept that."""
 
     def shape(self, toss: int) -> ObjectShape | None:
         return self.shapes.get(toss)
@@ -125,9 +130,12 @@ def _result_body(results: Results, record: VariantRecord, rank: int) -> Body:
         if record.toss(toss).shape or record.shape:
             shapes[toss] = results.shape(record.name, record.scope, toss)
     label = f"{record.label or record.name}, scope {record.scope}"
-    return Body(
-        entity_name(f"{record.name}_{record.scope}"), label, ESTIMATES[rank % len(ESTIMATES)], poses, shapes, rank == 0
-    )
+    name, color = entity_name(f"{record.name}_{record.scope}"), ESTIMATES[rank % len(ESTIMATES)]
+    if rank > 0:
+        return Body(name, label, color, poses, shapes, shown=False)
+    masks = {t.toss: read_masks(results.path / t.masks, t.toss) for t in record.tosses if t.masks}
+    found = {t.toss: find_notes(results, t.track, t.toss) for t in record.tosses}
+    return Body(name, label, color, poses, shapes, True, masks, {t: n for t, n in found.items() if n is not None})
 
 
 def bodies_scene(name: str, calibration: RigCalibration, bodies: Sequence[Body]) -> Scene:
