@@ -16,7 +16,7 @@ from numpy import ndarray as Array
 from scipy.spatial.transform import Rotation
 
 from processing.contact.motion import GRAVITY_M_S2, PoseSeries, differences
-from processing.contact.segment import Phases, pose_noise
+from processing.contact.segment import LEAST_SIGMA_M, TO_SIGMA, Phases
 from recordings.errors import BadInput
 
 LEAST_FRAMES = 5
@@ -27,7 +27,10 @@ FALL_TOLERANCE = 0.06
 """Relative error of the acceleration of free fall; 0.06 is 3 % of the step or 6 % of the scale."""
 PLANE_TOLERANCE_M = 0.005
 FALL_FRAMES = (20, 14, 10, 7, 5, 4)
-"""Lengths of the windows in which a fall is looked for."""
+LONGEST_FALL_S = 0.2
+"""Lengths of the windows in which a fall is looked for: a longer one at 30 Hz would span an impact."""
+MOST_FALL_ERROR_M_S2 = 0.4
+"""A window that knows its acceleration less well proves nothing."""
 SAME_HEIGHT_M = 1e-8
 SAME_FRAMES = 30
 IMPACT_M_S = 0.3
@@ -67,17 +70,29 @@ def measured_fall(tosses: Sequence[PoseSeries]) -> Fall | None:
     if len(found) < 3:
         return None
     values, errors = np.array([f.value for f in found]), np.array([f.error for f in found])
-    return Fall(float(np.median(values)), float(1.25 * np.sqrt((errors**2).mean() / len(found))))
+    middle = float(np.median(values))
+    spread = TO_SIGMA * float(np.median(np.abs(values - middle)))  # at 30 Hz some windows are bounces, and scatter
+    return Fall(middle, 1.25 * max(spread, float(np.sqrt((errors**2).mean()))) / len(found) ** 0.5)
 
 
 def _falls(series: PoseSeries) -> list[Fall]:
     """At most one fall: of the longest window length that has any, the window with the least misfit."""
-    noise = pose_noise(series).position_m
+    noise = _least_noise_m(series)
     for frames in FALL_FRAMES:
+        if (frames - 1) * series.step_s > LONGEST_FALL_S and frames > FALL_FRAMES[-1]:
+            continue
         windows = [w for i in range(len(series) - frames + 1) if (w := _parabola(series, i, frames, noise))]
         if windows:
             return [min(windows, key=lambda w: w[0])[1]]
     return []
+
+
+def _least_noise_m(series: PoseSeries) -> float:
+    """Pose noise from the quieter quarter of the sideways second differences: at 30 Hz contact fills the other ones."""
+    dt = np.diff(series.time_s)
+    bend = np.diff(np.diff(series.position_m[:, :2], axis=0) / dt[:, None], axis=0) * dt[1:, None]
+    quarter = float(np.quantile(np.abs(bend), 0.25)) if len(bend) else 0.0
+    return max(quarter / 0.3186 / 6**0.5, LEAST_SIGMA_M)  # 0.3186 sigma is the first quartile of a |Gaussian|
 
 
 def _parabola(series: PoseSeries, first: int, frames: int, noise_m: float) -> tuple[float, Fall] | None:
@@ -89,7 +104,12 @@ def _parabola(series: PoseSeries, first: int, frames: int, noise_m: float) -> tu
     left = float(np.sqrt(((p - A @ fit) ** 2).sum() / (3 * max(frames - 3, 1))))
     error = float(noise_m * inverse[2, 2] ** 0.5)
     sideways = float(np.abs(fit[2, :2]).max())
-    if left > 2 * noise_m or abs(fit[2, 2]) < 5 * error or sideways > 0.05 * abs(fit[2, 2]) + 3 * error:
+    if (
+        left > 2 * noise_m
+        or abs(fit[2, 2]) < 5 * error
+        or error > MOST_FALL_ERROR_M_S2
+        or sideways > 0.05 * abs(fit[2, 2]) + 3 * error
+    ):
         return None
     return left, Fall(float(fit[2, 2]), error)
 
