@@ -1,0 +1,292 @@
+"""By how much one device's stamps run behind another's, from the motion that both saw.
+
+`offset_s` is what must be ADDED to the other stream's stamps so that they mean the same instants as the reference's
+(`time_ns + offset_ns`). It is found together with a constant displacement between the two (calibration errors, another
+point of the body), so only the motion's course in time counts. Motion that no interpolation can follow (impacts) is
+left out. Offsets of several tosses are pooled by their variances, widened where they scatter more than they should.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+from numpy import ndarray as Array
+from scipy.spatial.transform import Rotation, Slerp
+
+from calibration.extrinsics import whitening
+from calibration.poses import exp_poses
+from calibration.report import Finding, Report, limit
+from calibration.targets import TargetView
+from recordings.errors import BadInput
+from recordings.geometry import CameraModel
+
+GOOD_MS, WORST_MS = 1.0, 5.0
+LEAST_SPEED_M_S = 0.15
+GRAVITY_M_S2 = 9.81
+JERKY_M_S2 = 20.0
+"""Accelerations further than this from both rest and free fall belong to an impact."""
+SEARCH_S = 0.1
+FINEST_S = 1e-6
+RIG_TURN, RIG_SHIFT_M = 0.003, 0.003
+"""How far calibration may be off (standard deviations) while the offset is found."""
+POINT_M, FRAME_TURN, FRAME_SHIFT_M = 0.1, 0.02, 0.02
+"""The same between two courses: another point of the body, another frame."""
+HUBER = 2.5
+LEAST_FRAMES = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Path3:
+    """A body's course: times in s, positions, and rotations where known."""
+
+    time_s: Float[Array, " n"]
+    position_m: Float[Array, "n 3"]
+    rotation: Float[Array, "n 3 3"] | None = None
+
+    @staticmethod
+    def of_poses(time_s: Float[Array, " n"], poses: Float[Array, "n 4 4"]) -> Path3:
+        return Path3(time_s, poses[:, :3, 3], poses[:, :3, :3])
+
+    def smooth_at(self, time_s: Float[Array, " m"]) -> Bool[Array, " m"]:
+        """Where interpolation can be trusted: inside the course, no gap, no impact within the four frames around."""
+        step = np.median(np.diff(self.time_s))
+        after = np.searchsorted(self.time_s, time_s)
+        inside = (after >= 1) & (after < len(self.time_s))
+        at = after.clip(1, len(self.time_s) - 1)
+        gap = self.time_s[at] - self.time_s[at - 1] > 1.6 * step
+        rough = self._rough()
+        near = np.zeros(len(time_s), dtype=bool)
+        for shift in (-1, 0):
+            near |= rough[(at + shift).clip(0, len(rough) - 1)]
+        return inside & ~gap & ~near
+
+    def _rough(self) -> Bool[Array, " n"]:
+        """Frames whose second difference is neither rest nor free fall (in any direction: frames need not be level)."""
+        rough = np.zeros(len(self.time_s), dtype=bool)
+        if len(self.time_s) < 3:
+            return rough
+        before, behind = np.diff(self.time_s)[:-1], np.diff(self.time_s)[1:]
+        speed = np.diff(self.position_m, axis=0) / np.diff(self.time_s)[:, None]
+        bend = np.linalg.norm((speed[1:] - speed[:-1]) / ((before + behind) / 2)[:, None], axis=1)
+        rough[1:-1] = bend > GRAVITY_M_S2 + JERKY_M_S2
+        return rough
+
+    def at(self, time_s: Float[Array, " m"]) -> tuple[Float[Array, "m 3"], Float[Array, "m 3 3"]]:
+        """Positions by a cubic through the four nearest frames (exact in free fall), rotations by slerp."""
+        t = np.clip(time_s, self.time_s[0], self.time_s[-1])
+        position = _cubic(self.time_s, self.position_m, t)
+        if self.rotation is None:
+            return position, np.tile(np.eye(3), (len(t), 1, 1))
+        return position, Slerp(self.time_s, Rotation.from_matrix(self.rotation))(t).as_matrix()
+
+
+def _cubic(times: Float[Array, " n"], values: Float[Array, "n 3"], at: Float[Array, " m"]) -> Float[Array, "m 3"]:
+    """Lagrange's cubic through the two frames before and the two after (three or two at the ends)."""
+    first = (np.searchsorted(times, at) - 2).clip(0, max(0, len(times) - 4))
+    count = min(4, len(times))
+    out = np.zeros((len(at), 3))
+    for k in range(count):
+        share = np.ones(len(at))
+        for j in range(count):
+            if j != k:
+                share *= (at - times[first + j]) / (times[first + k] - times[first + j])
+        out += share[:, None] * values[first + k]
+    return out
+
+
+@dataclass(frozen=True)
+class TimeOffset:
+    """Add `offset_s` to the other stream's stamps. `frames`: how many of its frames took part."""
+
+    offset_s: float
+    std_s: float
+    frames: int
+    rms: float
+    """What is left over: mm between courses, px between corners."""
+
+
+def offset_of_paths(reference: Path3, other: Path3) -> TimeOffset:
+    """Between two courses of one rigid body, in frames that may differ by a constant displacement on either side.
+
+    With rotations on the reference the other's point may be anywhere on the body. Raises BadInput where nothing moves.
+    """
+
+    def gap(offset_s: float, numbers: Array) -> Array:
+        position, rotation = reference.at(other.time_s + offset_s)
+        carried = position + rotation @ numbers[:3] if reference.rotation is not None else position
+        turned = carried @ exp_poses(np.concatenate([numbers[3:6], np.zeros(3)])[None])[0, :3, :3].T + numbers[6:9]
+        return 1e3 * (turned - other.position_m)
+
+    weight = 1.0 / np.array([POINT_M] * 3 + [FRAME_TURN] * 3 + [FRAME_SHIFT_M] * 3)
+    return _solve(reference, other.time_s, gap, weight, np.zeros(9), whiten=None)
+
+
+def offset_of_corners(
+    reference: Path3,
+    model: CameraModel,
+    camera_from_rig: Float[Array, "4 4"],
+    frames: Sequence[tuple[float, TargetView]],
+) -> TimeOffset:
+    """Between a course of poses (rig_from_body) and tag corners that a camera with its own stamps saw: `frames` are
+    (stamp in s, corners with their places on the body). The camera's place may be off by a few mm and mrad."""
+    frames = [f for f in frames if len(f[1]) >= 4]
+    if len(frames) < LEAST_FRAMES:
+        raise BadInput(f"the camera sees the object's tags in {len(frames)} frames; wanted at least {LEAST_FRAMES}")
+    stamps = np.repeat([t for t, _ in frames], [len(v) for _, v in frames])
+    points = np.concatenate([v.points_m for _, v in frames])
+    pixels = np.concatenate([v.pixels for _, v in frames])
+    white = whitening(np.concatenate([v.covariance_px2 for _, v in frames]))
+
+    def gap(offset_s: float, numbers: Array) -> Array:
+        position, rotation = reference.at(stamps + offset_s)
+        in_rig = np.einsum("nij,nj->ni", rotation, points) + position
+        placed = exp_poses(numbers[None])[0] @ camera_from_rig
+        seen = model.project(in_rig @ placed[:3, :3].T + placed[:3, 3])
+        return np.where(np.isfinite(seen), seen - pixels, 1e3)
+
+    weight = 1.0 / np.array([RIG_TURN] * 3 + [RIG_SHIFT_M] * 3)
+    return _solve(reference, stamps, gap, weight, np.zeros(6), whiten=white)
+
+
+def _solve(
+    reference: Path3,
+    stamps: Float[Array, " n"],
+    gap: Callable[[float, Array], Array],
+    prior: Float[Array, " k"],
+    start: Float[Array, " k"],
+    whiten: Float[Array, "n 2 2"] | None,
+) -> TimeOffset:
+    """Coarse search for the offset, then Gauss-Newton over offset and displacement with robust weights."""
+    course = np.linalg.norm(np.diff(reference.position_m, axis=0), axis=1) / np.diff(reference.time_s)
+    if not len(course) or np.quantile(course, 0.9) < LEAST_SPEED_M_S:
+        raise BadInput(
+            f"the body hardly moves ({np.max(course, initial=0):.2f} m/s at most), so its motion shows no time offset; "
+            "wanted a toss"
+        )
+
+    def residual(numbers: Array) -> Array:
+        raw = gap(numbers[0], numbers[1:])
+        return raw if whiten is None else np.einsum("nij,nj->ni", whiten, raw)
+
+    best: tuple[float, Array] | None = None
+    for offset in np.linspace(-SEARCH_S, SEARCH_S, 21):
+        numbers = _fit(residual, np.concatenate([[offset], start]), prior, _used(reference, stamps, offset), 2, True)
+        error = _error(residual, numbers, _used(reference, stamps, numbers[0]))
+        if np.isfinite(error) and (best is None or error < best[0]):
+            best = (error, numbers)
+    if best is None:
+        raise BadInput("the two streams do not overlap in time within 0.1 s; are they of the same toss and clock?")
+    numbers = best[1]
+    for _ in range(3):
+        numbers = _fit(residual, numbers, prior, _used(reference, stamps, numbers[0]), 6, False)
+    used = _used(reference, stamps, numbers[0])
+    return _finished(residual, gap, numbers, prior, used, stamps)
+
+
+def _used(reference: Path3, stamps: Float[Array, " n"], offset_s: float) -> Bool[Array, " n"]:
+    return reference.smooth_at(stamps + offset_s)
+
+
+def _error(residual: Callable[[Array], Array], numbers: Array, used: Bool[Array, " n"]) -> float:
+    if used.sum() < LEAST_FRAMES:
+        return float("inf")
+    return float(np.median(np.abs(residual(numbers)[used])))
+
+
+def _system(
+    residual: Callable[[Array], Array], numbers: Array, prior: Array, used: Bool[Array, " n"]
+) -> tuple[Array, Array, float]:
+    """Weighted derivatives and residuals with the prior's rows, and the residuals' robust scale."""
+    here = residual(numbers)[used].ravel()
+    steps = np.concatenate([[1e-5], np.full(len(numbers) - 1, 1e-6)])
+    J = np.stack(
+        [(residual(numbers + s * np.eye(len(numbers))[k])[used].ravel() - here) / s for k, s in enumerate(steps)], -1
+    )
+    scale = max(1.4826 * float(np.median(np.abs(here))), 1e-9)
+    weight = np.sqrt(np.minimum(1.0, HUBER * scale / np.maximum(np.abs(here), 1e-12))) / scale
+    rows = np.hstack([np.zeros((len(prior), 1)), np.diag(prior)])
+    return np.vstack([weight[:, None] * J, rows]), np.concatenate([weight * here, prior * numbers[1:]]), scale
+
+
+def _fit(
+    residual: Callable[[Array], Array],
+    numbers: Array,
+    prior: Array,
+    used: Bool[Array, " n"],
+    steps: int,
+    hold_offset: bool,
+) -> Array:
+    if used.sum() < LEAST_FRAMES:
+        return numbers
+    for _ in range(steps):
+        J, left, _ = _system(residual, numbers, prior, used)
+        if hold_offset:
+            J = J.copy()
+            J[:, 0] = 0.0
+        change = np.linalg.lstsq(J, -left, rcond=None)[0]
+        change[0] = np.clip(change[0], -0.02, 0.02)
+        numbers = numbers + change
+        if abs(change[0]) < FINEST_S and not hold_offset:
+            break
+    return numbers
+
+
+def _finished(
+    residual: Callable[[Array], Array],
+    gap: Callable[[float, Array], Array],
+    numbers: Array,
+    prior: Array,
+    used: Bool[Array, " n"],
+    stamps: Array,
+) -> TimeOffset:
+    J, left, _ = _system(residual, numbers, prior, used)
+    frames = len(np.unique(stamps[used]))
+    per_frame = max(1.0, used.sum() / max(frames, 1))
+    # points of one frame err together (interpolation, pose), so frames count, not points
+    variance = np.linalg.pinv(J.T @ J, hermitian=True)[0, 0] * max(1.0, float(left @ left) / len(left)) * per_frame
+    rms = float(np.sqrt((gap(numbers[0], numbers[1:])[used] ** 2).mean()))
+    return TimeOffset(float(numbers[0]), float(np.sqrt(variance)), frames, rms)
+
+
+def pooled(offsets: Sequence[TimeOffset]) -> TimeOffset:
+    """Several tosses' offsets as one, weighted by their variances; wider where they scatter more than they say."""
+    if not offsets:
+        raise BadInput("no toss gave a time offset")
+    value, variance = (np.array([getattr(o, n) for o in offsets]) for n in ("offset_s", "std_s"))
+    weight = 1.0 / np.maximum(variance, 1e-6) ** 2
+    mean = float((weight * value).sum() / weight.sum())
+    std = float(1.0 / np.sqrt(weight.sum()))
+    if len(offsets) > 1:
+        std *= max(1.0, float(np.sqrt((weight * (value - mean) ** 2).sum() / (len(offsets) - 1))))
+    return TimeOffset(mean, std, sum(o.frames for o in offsets), float(np.median([o.rms for o in offsets])))
+
+
+def offset_report(stream: str, reference: str, by_toss: Mapping[int, TimeOffset], failed: Mapping[int, str]) -> Report:
+    """Pooled offset, each toss against the pool of the others as hold-out, and a verdict."""
+    whole = pooled(list(by_toss.values()))
+    aside = [
+        1e3 * (one.offset_s - pooled([o for k, o in by_toss.items() if k != toss]).offset_s)
+        for toss, one in by_toss.items()
+        if len(by_toss) > 1
+    ]
+    findings = limit(1e3 * whole.std_s, f"the standard deviation of {stream}'s offset", "ms", GOOD_MS, WORST_MS)
+    if failed:
+        listed = "; ".join(f"{k}: {v}" for k, v in failed.items())
+        findings.append(Finding("note", f"tosses without an offset: {listed}"))
+    if len(by_toss) > 2:
+        spread = float(np.std([o.offset_s for o in by_toss.values()]))
+        expected = float(np.sqrt(np.mean([o.std_s**2 for o in by_toss.values()])))
+        if spread > 3 * expected + 2e-4:
+            text = f"{stream}'s offset scatters by {1e3 * spread:.2f} ms between tosses, expected {1e3 * expected:.2f}"
+            findings.append(Finding("warning", f"{text}: its stamps are not synchronised with {reference}'s"))
+    return Report(
+        f"time of {stream} against {reference}",
+        {"offset_ms": 1e3 * whole.offset_s, "rms_left": whole.rms, "tosses": len(by_toss), "frames": whole.frames},
+        {"toss_against_others_ms": aside},
+        {"offset_ms": 1e3 * whole.std_s},
+        tuple(findings),
+        {"by_toss_ms": {str(k): [1e3 * o.offset_s, 1e3 * o.std_s] for k, o in by_toss.items()}},
+    )
