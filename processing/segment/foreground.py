@@ -29,6 +29,9 @@ class ForegroundSettings:
     """The same as a share of the object's typical difference nearby: a blurred edge lies where it halves."""
     weight_color: float = 2.0
     weight_scene_color: float = 1.5
+    contrast: float = 2.0
+    """An object that differs from the scene by so many times the least step is told from it by colour in full."""
+    least_contrast: float = 0.15
     weight_nearer: float = 1.5
     weight_scene_depth: float = 1.5
     middle_sigmas: float = 3.0
@@ -105,7 +108,10 @@ def evidence(
     typical = cv2.blur(plain * inside, (9, 9)) / np.maximum(cv2.blur(inside, (9, 9)), 1e-3)
     least = np.maximum(s.color_step + 3 * scene.color_sigma[at], s.color_share * typical)
     sure = np.clip(np.abs(differs - least) / (0.3 * least), 0.2, 1.0)
-    by_color = np.where(differs > least, s.weight_color, -s.weight_scene_color) * sure * scene.known[at]
+    # where the object looks like the scene behind it, a colour like the scene's speaks for neither
+    contrast = np.clip(typical / (s.contrast * (s.color_step + 3 * scene.color_sigma[at])), s.least_contrast, 1.0)
+    against = s.weight_scene_color * np.where(inside.any(), contrast, 1.0)
+    by_color = np.where(differs > least, s.weight_color, -against) * sure * scene.known[at]
     sigma = np.maximum(scene.depth_sigma_m[at], 0.7 * stereo_sigma_m(scene_depth))
     step = (scene_depth - depth) / np.maximum(sigma, 1e-4) - s.middle_sigmas
     graded = np.clip(s.weight_sigma * step, -s.weight_scene_depth, s.weight_nearer)

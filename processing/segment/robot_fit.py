@@ -34,11 +34,11 @@ STEP_NS = 4_000_000
 class RobotFitSettings:
     """How the robot's place, delay and the depth's scale are fitted."""
 
-    frames: int = 24
+    frames: int = 18
     """Frames of the session that are looked at: half spread evenly, half where the arm is fastest."""
     stride: int = 4
     """Every stride-th pixel of rows and columns gives a depth residual."""
-    steps: int = 8
+    steps: int = 6
     widest_m: float = 0.04
     """Depth differences beyond this are something else in the first step; it narrows to `narrowest_m`."""
     narrowest_m: float = 0.01
@@ -124,6 +124,15 @@ class _Residuals:
     raw: Float[Array, " n"]
 
 
+@dataclass(frozen=True, eq=False)
+class _Edges:
+    """Where one frame's outline is looked for: its difference from the scene, where that is known, and how far."""
+
+    difference: Float32[Array, "h w"]
+    known: Bool[Array, "h w"]
+    reach_px: float
+
+
 def choose_sights(
     counts: Sequence[int], speed: Callable[[int, int], float], settings: RobotFitSettings
 ) -> list[tuple[int, int]]:
@@ -152,6 +161,7 @@ def fit_robot(
         return _refused(start, "no frame with joint states")
     fine = RobotView(sights[0].path.robot, camera)
     coarse = fine.coarser(settings.stride)
+    differences = [difference_from(scene, s.frame) for s in sights]
     state = start
     history: list[tuple[_Residuals, _Residuals]] = []
     for k in range(settings.steps):
@@ -159,7 +169,8 @@ def fit_robot(
         gate = settings.widest_m * (settings.narrowest_m / settings.widest_m) ** share
         depth = _joined([_depth_rows(s, coarse, state, gate, settings) for s in sights])
         reach = settings.reach_px * 3.0**-share
-        outline = _joined([_outline_rows(s, fine, camera, state, scene, reach, settings) for s in sights])
+        edges = [_Edges(d, scene.known, reach) for d in differences]
+        outline = _joined([_outline_rows(s, e, fine, camera, state, settings) for s, e in zip(sights, edges)])
         if len(depth.r) < settings.least_samples:
             return _refused(start, f"only {len(depth.r)} depth samples on the robot")
         history.append((depth, outline))
@@ -254,11 +265,10 @@ def _by_motion(normal: Array, arm: Array, velocity: Array) -> Float[Array, "n 8"
 
 def _outline_rows(
     sight: Sight,
+    edges: _Edges,
     view: RobotView,
     camera: CameraModel,
     state: _State,
-    scene: StaticScene,
-    reach_px: float,
     s: RobotFitSettings,
 ) -> _Residuals:
     time_ns = sight.frame.time_ns
@@ -267,7 +277,7 @@ def _outline_rows(
     if outline is None:
         return _nothing()
     pixels, outward = outline
-    offset = edge_offsets(difference_from(scene, sight.frame), scene.known, pixels, outward, reach_px, s)
+    offset = edge_offsets(edges.difference, edges.known, pixels, outward, edges.reach_px, s)
     found = np.isfinite(offset)
     pixels, outward, offset = pixels[found], outward[found], offset[found]
     u, v = np.round(pixels).astype(int).T

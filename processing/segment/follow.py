@@ -1,0 +1,242 @@
+"""One step of the background segmenter: where the object is in the next frame, from what is known of the last ones."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Float32
+from numpy import ndarray as Array
+
+from processing.segment.foreground import (
+    ForegroundSettings,
+    evidence,
+    fill_holes,
+    kernel,
+    moved_pixels,
+    nearer_than_scene,
+    refine_border,
+    smooth,
+    window_around,
+)
+from processing.segment.likeness import Likeness
+from processing.segment.static_scene import StaticScene
+from recordings.records import RgbdFrame
+
+
+@dataclass(frozen=True)
+class BackgroundSettings:
+    """How masks are followed from frame to frame."""
+
+    foreground: ForegroundSettings = field(default_factory=ForegroundSettings)
+    least_px: int = 120
+    """A smaller thing is not the object."""
+    grown: float = 1.4
+    """A component larger than the expected mask by this factor holds something else as well."""
+    turned: float = 0.6
+    """What has grown on the object is its own within this share of its size."""
+    depth_margin_m: float = 0.04
+    """The object's depth in a frame exceeds the last frame's range by no more than this, when others touch it."""
+    sure: float = 0.7
+    """Colours are learned from masks that are more confident than this."""
+    piece_px: int = 25
+    """A smaller piece behind a finger is not looked for."""
+    piece_reach_px: int = 8
+    """How far outside of the object's hull such a piece may lie."""
+    part_of_scene: float = 0.9
+    """An object less of which stands out from the scene than this was partly learned as scene."""
+    unknown: float = 0.02
+    """A component with a larger share of pixels whose scene is unknown is told by its own colours."""
+
+
+@dataclass(frozen=True, eq=False)
+class Memory:
+    """What is known when the next frame comes."""
+
+    mask: Bool[Array, "h w"]
+    velocity_px: Float[Array, "2"]
+    depth_range_m: tuple[float, float]
+    likeness: Likeness
+    missed: int = 0
+    others_near: bool = False
+    """Something else that is not scene was near the object in the last frame: a hand, a stick."""
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """The object in one frame. `others_px`: pixels near it that are neither scene nor robot nor the object."""
+
+    mask: Bool[Array, "h w"]
+    confidence: float
+    others_px: int = 0
+    others_near: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Beside:
+    """What the robot's drawing adds: log-odds of the object's colours against the robot's, and where the scene is
+    unknown though no robot stands there."""
+
+    odds: Float32[Array, "h w"]
+    unknown: Bool[Array, "h w"]
+
+
+def remember(memory: Memory | None, frame: RgbdFrame, found: Found, learn: bool = True) -> Memory:
+    """Memory after a frame. An empty mask leaves everything but the count of misses; colours are learned on request."""
+    mask = found.mask
+    if memory is not None and not mask.any():
+        return replace(memory, missed=memory.missed + 1)
+    depth = frame.depth_m[mask & (frame.depth_m > 0)]
+    low, high = (float(d) for d in np.quantile(depth, (0.02, 0.98))) if len(depth) > 10 else (0.0, 20.0)
+    if memory is None:
+        return Memory(mask, np.zeros(2), (low, high), Likeness.of(frame.color_rgb, mask))
+    velocity = (_center(mask) - _center(memory.mask)) / (memory.missed + 1)
+    likeness = memory.likeness.learned(frame.color_rgb, mask) if learn else memory.likeness
+    return Memory(mask, velocity, (low, high), likeness, others_near=found.others_near)
+
+
+def _center(mask: Bool[Array, "h w"]) -> Float[Array, "2"]:
+    """Centroid (x, y) in pixels."""
+    moments = cv2.moments(mask.astype(np.uint8), binaryImage=True)
+    return np.array([moments["m10"], moments["m01"]]) / max(moments["m00"], 1.0)
+
+
+def follow(
+    frame: RgbdFrame,
+    scene: StaticScene,
+    memory: Memory,
+    block: Bool[Array, "h w"] | None,
+    beside: Beside | None,
+    s: BackgroundSettings,
+) -> Found:
+    """The mask in the next frame; empty with confidence 0 where the object is not found."""
+    shift = memory.velocity_px * (memory.missed + 1)
+    expected = _shifted(memory.mask, shift)
+    area = int(memory.mask.sum())
+    reach = int(0.6 * np.sqrt(area)) * (memory.missed + 1) + 4
+    near = cv2.dilate(expected.astype(np.uint8), kernel(min(reach, 150))) > 0
+    moved = moved_pixels(frame, scene, s.foreground)
+    likeness = memory.likeness.log_odds(frame.color_rgb)
+    moved &= scene.known | nearer_than_scene(frame.depth_m, scene, s.foreground) | (likeness > 0)
+    if block is not None:
+        moved &= ~block
+    rough = _component_in(moved, near)
+    if beside is not None:
+        rough |= _other_pieces(frame, moved & ~rough, expected, beside, memory, s)
+    others = moved & near & ~(cv2.dilate(rough.astype(np.uint8), kernel(3)) > 0)
+    others_px = int(others.sum())
+    if rough.sum() < s.least_px:
+        return Found(np.zeros_like(rough), 0.0, others_px, False)
+    wide = cv2.dilate(rough.astype(np.uint8), kernel(5)) > 0
+    strange = (wide & (~scene.known if beside is None else beside.unknown)).sum() > s.unknown * rough.sum()
+    grown = rough.sum() > s.grown * area
+    if strange or (grown and not _is_all_object(frame, rough, expected, memory, s)):
+        rough = _among_others(frame, scene, moved, expected, memory, beside, s)
+        if rough.sum() < s.least_px:
+            return Found(np.zeros_like(rough), 0.0, others_px, True)
+        mask, sure = rough, 0.6
+    else:
+        least = None if beside is None else s.piece_px
+        odds = None if beside is None else beside.odds
+        mask, sure = refine_border(frame, scene, rough, odds, s.foreground, least)
+    if block is not None:
+        mask = mask & ~block
+    ratio = min(mask.sum(), area) / max(mask.sum(), area, 1)
+    others_near = others_px > s.least_px or int((moved & near & ~mask).sum()) > 3 * s.least_px
+    return Found(mask, float(np.clip(sure * min(1.0, ratio / 0.7), 0, 1)), others_px, others_near)
+
+
+def _shifted(mask: Bool[Array, "h w"], by_px: Float[Array, "2"]) -> Bool[Array, "h w"]:
+    moved = np.array([[1, 0, by_px[0]], [0, 1, by_px[1]]], dtype=np.float32)
+    return cv2.warpAffine(mask.astype(np.uint8), moved, mask.shape[::-1], flags=cv2.INTER_NEAREST) > 0
+
+
+def _component_in(mask: Bool[Array, "h w"], region: Bool[Array, "h w"]) -> Bool[Array, "h w"]:
+    """The component that has most pixels in a region."""
+    count, labels = cv2.connectedComponents(mask.astype(np.uint8), connectivity=4)
+    inside = np.bincount(labels[region], minlength=count)
+    inside[0] = 0
+    return labels == int(inside.argmax()) if inside.any() else np.zeros_like(mask)
+
+
+def _is_all_object(
+    frame: RgbdFrame,
+    rough: Bool[Array, "h w"],
+    expected: Bool[Array, "h w"],
+    memory: Memory,
+    s: BackgroundSettings,
+) -> bool:
+    """Whether what has grown on the object is its own, as of a box that turns its broad side.
+
+    It lies at the object's depth and does not reach far, and nothing else was near that could have touched it.
+    """
+    added = rough & ~expected
+    reach = cv2.distanceTransform((~expected).astype(np.uint8), cv2.DIST_L2, 3)[added]
+    if memory.others_near or np.quantile(reach, 0.95) > s.turned * np.sqrt(memory.mask.sum()):
+        return False
+    low, high = memory.depth_range_m
+    depth = frame.depth_m[added & (frame.depth_m > 0)]
+    inside = (depth > low - s.depth_margin_m) & (depth < high + s.depth_margin_m)
+    alike = memory.likeness.log_odds(frame.color_rgb)[added]
+    return bool(len(depth) > 0 and inside.mean() > 0.9 and alike.mean() > -0.5)
+
+
+def _other_pieces(
+    frame: RgbdFrame,
+    moved: Bool[Array, "h w"],
+    expected: Bool[Array, "h w"],
+    beside: Beside,
+    memory: Memory,
+    s: BackgroundSettings,
+) -> Bool[Array, "h w"]:
+    """What a finger has cut off the object: pieces of its colours and depth beside the robot, where it is expected."""
+    out = np.zeros_like(expected)
+    corners = cv2.findNonZero(expected.astype(np.uint8))
+    if corners is None:
+        return out
+    hull = cv2.fillConvexPoly(np.zeros(expected.shape, np.uint8), cv2.convexHull(corners), 1)
+    whole = cv2.dilate(hull, kernel(s.piece_reach_px)) > 0
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(moved.astype(np.uint8), connectivity=4)
+    low, high = memory.depth_range_m
+    for k in range(1, count):
+        if stats[k, cv2.CC_STAT_AREA] < s.piece_px:
+            continue
+        piece = np.asarray(labels == k)
+        depth = frame.depth_m[piece & (frame.depth_m > 0)]
+        inside = len(depth) > 0 and low - s.depth_margin_m < float(np.median(depth)) < high + s.depth_margin_m
+        close = beside.odds[piece] != 0
+        alike = close.any() and float(beside.odds[piece][close].mean()) > 0
+        if inside and alike and whole[piece].mean() > 0.6:
+            out |= piece
+    return out
+
+
+def _among_others(
+    frame: RgbdFrame,
+    scene: StaticScene,
+    moved: Bool[Array, "h w"],
+    expected: Bool[Array, "h w"],
+    memory: Memory,
+    beside: Beside | None,
+    s: BackgroundSettings,
+) -> Bool[Array, "h w"]:
+    """The object among other things that are not scene either: by its colours, its depth and where it is expected."""
+    at = window_around(expected, 30)
+    if at is None:
+        return np.zeros_like(expected)
+    not_scene = np.minimum(evidence(frame, scene, expected, at, None, s.foreground), 1.0)
+    inward = cv2.distanceTransform(expected[at].astype(np.uint8), cv2.DIST_L2, 3)
+    outward = cv2.distanceTransform((~expected[at]).astype(np.uint8), cv2.DIST_L2, 3)
+    place = np.clip((inward - outward) / 5.0, -3.0, 1.5)
+    depth, (low, high) = frame.depth_m[at], memory.depth_range_m
+    elsewhere = (depth > 0) & ((depth < low - s.depth_margin_m) | (depth > high + s.depth_margin_m))
+    likeness = memory.likeness.log_odds(frame.color_rgb[at], crowded=True)
+    if beside is not None:
+        likeness = np.minimum(likeness, np.where(beside.odds[at] != 0, beside.odds[at], likeness))
+    odds = not_scene + s.foreground.weight_likeness * likeness + place - 4.0 * elsewhere
+    odds = np.where(moved[at], odds, np.minimum(odds, -1.0)).astype(np.float32)
+    belief = smooth(odds, frame.color_rgb[at].astype(np.float32), s.foreground)
+    out = np.zeros_like(expected)
+    out[at] = cv2.morphologyEx((belief > 0).astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)) > 0
+    return fill_holes(_component_in(out, expected))
