@@ -11,15 +11,19 @@ import numpy as np
 import pytest
 import torch
 
+from processing.track.beam import Candidate
 from processing.track.features import FeatureMatcher, Features, RansacConfig, Sift, relative_motions
 from processing.track.matchers import PictureConfig, picture_of
 from processing.track.matchers_lightglue import LightGlue, LightGlueConfig, empty_network, root_sift
 from processing.track.matchers_loftr import Grid, Loftr, LoftrConfig
 from processing.track.matchers_xfeat import XFeat, XFeatConfig
+from processing.track.notes import NotesConfig, notes_of
+from processing.track.sequence import TossTrack
 from processing.track.views import Optics, ViewConfig, ViewStore, cut
 from recordings.errors import BadInput
 from recordings.geometry import CameraModel, rotation_exp
 from recordings.records import RgbdFrame
+from recordings.tracks import ObjectTrack
 
 WIDTH, HEIGHT, FOCAL, HALF_M, FAR_M = 200, 150, 260.0, 0.1, 0.5
 CAMERA = CameraModel("d455", WIDTH, HEIGHT, np.array([[FOCAL, 0, 99.5], [0, FOCAL, 74.5], [0, 0, 1.0]]))
@@ -184,6 +188,28 @@ def test_loftrs_grid_gives_each_place_the_point_under_it(store: ViewStore) -> No
     uv = (in_crop - grid.picture.corner + 0.5) * grid.picture.scale - 0.5
     np.testing.assert_array_equal(grid.rows(uv), np.arange(len(grid.points_m)))
     assert (grid.rows(np.array([[-5.0, 0], [1e4, 0]])) == -1).all()
+
+
+def tracked(store: ViewStore, second: np.ndarray) -> TossTrack:
+    """A track of the two views and of nothing, with three poses that were not taken."""
+    poses = np.stack([POSES[0], second, np.full((4, 4), np.nan)])
+    status = ("tracked", "tracked", "lost")
+    track = ObjectTrack(0, "d455", "object", np.arange(3), poses, status, np.full((3, 6, 6), np.nan))
+    tried = [Candidate(POSES[0], fit, 0.0, 1.0, "prior") for fit in (0.5, 0.3, 0.4)]
+    figures = np.array([0.1, 0.1, np.nan])
+    return TossTrack(track, figures, figures, (0,), np.array([[0, 1]]), {1: tried}, np.zeros(3), 1.0, store)
+
+
+def test_notes_keep_the_cheapest_rejected_poses_and_matches_that_the_poses_judge(store: ViewStore) -> None:
+    rejected, matches = notes_of(tracked(store, POSES[1]), Sift(), config=NotesConfig(most_rejected=2))
+    np.testing.assert_array_equal(rejected.frame, [1, 1])
+    np.testing.assert_array_equal(rejected.cost, [0.3, 0.4])
+    assert {tuple(pair) for pair in matches.frames.tolist()} == {(1, 0)}  # the keyframe has no other to be matched with
+    assert matches.agrees.mean() > 0.8
+    shifted = POSES[1].copy()
+    shifted[2, 3] += 0.03
+    wrong = notes_of(tracked(store, shifted), Sift())[1]
+    assert wrong.agrees.mean() < 0.05
 
 
 def test_root_sift_has_length_one_and_keeps_the_order() -> None:
