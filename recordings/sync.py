@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 from jaxtyping import Int64
 from numpy import ndarray as Array
@@ -45,3 +48,14 @@ def gaps(times_ns: Int64[Array, " n"], period_ns: int) -> list[tuple[int, int]]:
     """Where frames are missing: (position after which, how many) for every step of 1.5 periods or more."""
     steps = np.rint(np.diff(times_ns) / period_ns).astype(int)
     return [(int(i), int(steps[i]) - 1) for i in np.flatnonzero(np.diff(times_ns) >= 1.5 * period_ns)]
+
+
+def clock_offset_ns(residuals: Mapping[str, Any], stream: str) -> int:
+    """What to add to a stream's stamps so that they mean the same instants as the colour camera's: 0 where not measured.
+
+    `residuals` of calibration.json hold it as `time.offsets.<stream>.offset_ns`; streams are `mono` (the cameras that
+    are triggered together) and `arm`. Measured by `toss-calibrate time`; recorded stamps are never changed.
+    """
+    offsets = residuals.get("time", {}).get("offsets", {}) if isinstance(residuals.get("time"), Mapping) else {}
+    one = offsets.get(stream, {})
+    return int(one.get("offset_ns", 0)) if isinstance(one, Mapping) else 0
