@@ -51,7 +51,7 @@ def gaps(times_ns: Int64[Array, " n"], period_ns: int) -> list[tuple[int, int]]:
 
 
 def clock_offset_ns(residuals: Mapping[str, Any], stream: str) -> int:
-    """What to add to a stream's stamps so that they mean the same instants as the colour camera's: 0 where not measured.
+    """What to add to a stream's stamps so that they mean the colour camera's instants: 0 where nobody measured.
 
     `residuals` of calibration.json hold it as `time.offsets.<stream>.offset_ns`; streams are `mono` (the cameras that
     are triggered together) and `arm`. Measured by `toss-calibrate time`; recorded stamps are never changed.
