@@ -10,8 +10,9 @@ A driver is any class with these methods; it needs no base class. The life of a 
 The rules that every driver keeps (tests/acquisition/drivers/test_behaviour.py runs on all of them):
 - `read(timeout_s)` never waits longer than its timeout. None: nothing came. `DeviceLost`: nothing will come any more.
 - No call but `open` waits longer than 2 s. `stop` and `close` may be called at any time, twice, from another thread.
-- Frame numbers grow; a gap in them is a loss on the way from the device. What the driver itself threw away, or saw
-  missing, is counted in `health().dropped`, by stream.
+- Frame numbers grow; a gap in them is a loss on the way from the device. What the driver itself threw away is counted
+  in `health().dropped`, by stream; a driver that sees the gaps may count them there too: who counts the gaps in the
+  numbers does not add the two.
 - Stamps are as the device gave them (`Stamp`): no driver maps clocks. `host_ns` is `time.monotonic_ns()` at receipt.
 - A device that is not there, or is another one than the rig asks for: `recordings.errors.DeviceNotFound`, naming what
   was found.

@@ -31,7 +31,7 @@ class FrankaArm(WorkerArm):
     def __init__(
         self,
         name: str = "arm",
-        host: str = "172.16.0.2",
+        host: str = "",
         serial: str | None = None,
         realtime: Literal["ignore", "enforce"] = "ignore",
     ) -> None:
@@ -40,7 +40,7 @@ class FrankaArm(WorkerArm):
         super().__init__([host, realtime])
 
     def open(self) -> None:
-        refuse_serial(self.name, self._serial)
+        check_identity(self.name, self._host, self._serial)
         super().open()
 
     def describe(self) -> dict[str, Any]:
@@ -62,8 +62,10 @@ class FrankaArm(WorkerArm):
         return not_opened(f"{self.name} (Panda at {self._host})", kind, reason)
 
 
-def refuse_serial(name: str, serial: str | None) -> None:
-    """The FCI names no device: a serial in the rig would be a check that nobody makes."""
+def check_identity(name: str, host: str, serial: str | None) -> None:
+    """The FCI names no device: it is known by its address, a serial in the rig would be a check that nobody makes."""
+    if not host:
+        raise DeviceRefused(f"{name}: no address; give the robot's as `address` in the rig")
     if serial is not None:
         raise DeviceRefused(
             f"{name}: found serial '{serial}' in the rig, but the FCI tells no serial number; identify the device by "

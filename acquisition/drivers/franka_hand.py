@@ -14,7 +14,7 @@ from importlib import metadata
 from typing import Any
 
 from acquisition.devices import DeviceLost, DeviceRefused, GripperCommand, GripperSample, Health
-from acquisition.drivers.franka import not_opened, refuse_serial
+from acquisition.drivers.franka import check_identity, not_opened
 from acquisition.drivers.franka_hand_worker import SAMPLE
 from acquisition.drivers.inbox import Inbox
 from acquisition.drivers.worker import Worker
@@ -30,7 +30,7 @@ SILENT_PERIODS = 4
 class FrankaHand:
     """The gripper of the Panda at `host`."""
 
-    def __init__(self, name: str = "gripper", host: str = "172.16.0.2", serial: str | None = None) -> None:
+    def __init__(self, name: str = "gripper", host: str = "", serial: str | None = None) -> None:
         self.name = name
         self._host, self._serial = host, serial
         self._worker: Worker | None = None
@@ -57,7 +57,7 @@ class FrankaHand:
 
     def open(self) -> None:
         """Connect. Raises DeviceNotFound where nothing answers."""
-        refuse_serial(self.name, self._serial)
+        check_identity(self.name, self._host, self._serial)
         self.close()
         self._clean()
         self._inbox = Inbox(BUFFER)

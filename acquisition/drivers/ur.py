@@ -35,7 +35,7 @@ class UrArm(WorkerArm):
     def __init__(
         self,
         name: str = "arm",
-        host: str = "192.168.0.100",
+        host: str = "",
         serial: str | None = None,
         lookahead_s: float = LOOKAHEAD_S,
         gain: float = GAIN,
@@ -50,6 +50,8 @@ class UrArm(WorkerArm):
         super().__init__([host, json.dumps(self._options)])
 
     def open(self) -> None:
+        if not self._host:
+            raise DeviceRefused(f"{self.name}: no address; give the robot's as `address` in the rig")
         super().open()
         found = str(self._about["serial"])
         if self._serial not in (None, found):

@@ -200,4 +200,6 @@ def test_another_fci_version_is_refused_and_says_which_is_wanted(free_host: str)
 def test_an_arm_that_is_not_there_says_what_to_check(free_host: str) -> None:
     with pytest.raises(DeviceNotFound, match="FCI is enabled in Desk"):
         FrankaHand(host=free_host).open()
+    with pytest.raises(DeviceRefused, match="no address"):
+        FrankaArm().open()
     assert "pip install -e .[rig-franka]" in str(not_opened("arm", "missing", "No module named panda_py"))

@@ -107,5 +107,7 @@ def test_what_it_is_for_is_said(free_host: str) -> None:
     assert "does not drive the Franka Panda" in str(ur.__doc__).replace("\n", " ")
     with pytest.raises(DeviceRefused, match="look"):
         UrArm(lookahead_s=0.5)
+    with pytest.raises(DeviceRefused, match="no address"):
+        UrArm().open()
     with pytest.raises(DeviceNotFound, match="does not answer"):
         UrArm(host=free_host).open()
