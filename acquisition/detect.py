@@ -239,12 +239,11 @@ def release_from_widths(widths: Float[Array, "n 2"]) -> Moment | None:
     k = lasting[0]
     held = float(np.median(width[max(0, k - 10) : k]))
     before_s, step_s = float(times[k - 1]), float(times[k] - times[k - 1])
-    if k + 1 < len(width) and width[k + 1] > width[k]:
-        speed = (width[k + 1] - width[k]) / max(times[k + 1] - times[k], 1e-6)
-        started = float(times[k] - (width[k] - held) / speed)
-    else:
-        started = before_s + 0.5 * step_s
-    return Moment(float(np.clip(started, before_s - step_s, times[k])), max(0.3 * step_s, 1e-3), "gripper width")
+    speeds = [(width[k] - held) / step_s]
+    if k + 1 < len(width):
+        speeds.append((width[k + 1] - width[k]) / float(times[k + 1] - times[k]))
+    started = float(times[k] - (width[k] - held) / max(speeds))
+    return Moment(float(np.clip(started, before_s, times[k])), max(0.3 * step_s, 1e-3), "gripper width")
 
 
 def flight_start_s(glimpses: Sequence[Glimpse]) -> float | None:

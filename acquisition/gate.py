@@ -10,6 +10,7 @@ from acquisition.devices import Image
 from acquisition.streams import Cause, Counter
 
 FROZEN_AFTER = 3
+LONGEST_GAP_FRAMES = 60
 RESTARTED_AFTER = 300
 """Numbers that fall by more than this begin anew (the device was started again)."""
 Level = Literal["info", "warning", "error"]
@@ -33,14 +34,17 @@ class Gate:
     topic: str
     counter: Counter
     troubles: list[Trouble] = field(default_factory=list)
+    period_ns: float = 0.0
+    """Between two frames, where the device's stamps can be trusted to show it (0: not watched)."""
     _number: int | None = None
+    _ticks: int | None = None
     _shape: tuple[int, ...] | None = None
     _digest: int = 0
     _alike: int = 0
 
     def restart(self) -> None:
         """Numbers begin anew."""
-        self._number = None
+        self._number = self._ticks = None
 
     def passes(self, image: Image) -> bool:
         """Whether to keep a frame. `troubles` then says what there is to tell."""
@@ -60,8 +64,21 @@ class Gate:
         if last is not None and image.number > last + 1:
             self.counter.missed(image.number - last - 1)
             self._tell(image, "gap", f"{image.number - last - 1} frames are missing before {image.number}")
-        self._number = image.number
+        elif last is not None:
+            self._watch_trigger(image)
+        self._number, self._ticks = image.number, image.stamp.ticks
         return None
+
+    def _watch_trigger(self, image: Image) -> None:
+        """A camera that was not triggered does not count: only its stamps are too far apart."""
+        if self._ticks is None or not self.period_ns or image.stamp.instant == "arrival":
+            return
+        ticks = image.stamp.ticks - self._ticks
+        passed_ns = (ticks % image.stamp.wrap_ticks if image.stamp.wrap_ticks else ticks) * image.stamp.tick_ns
+        missing = round(passed_ns / self.period_ns) - 1
+        if 0 < missing < LONGEST_GAP_FRAMES and abs(passed_ns / self.period_ns - missing - 1) < 0.25:
+            self.counter.missed(missing)
+            self._tell(image, "trigger", f"{missing} triggers were lost before {image.number}")
 
     def _shaped(self, image: Image) -> Cause | None:
         if self._shape is None:

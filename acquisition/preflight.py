@@ -145,9 +145,7 @@ def exposures(recorder: Recorder, calibration: RigCalibration) -> Iterator[Row]:
         state: State = "ok" if blur_px <= BLUR_PX else "warning" if blur_px < BLUR_BAD_PX else "fail"
         shorter_s = image.exposure_s * BLUR_PX / max(blur_px, 1e-9)
         found = f"{1e3 * image.exposure_s:.2f} ms: {blur_px:.1f} px of blur at {FASTEST_M_S:g} m/s"
-        yield Row(
-            "exposure", name, state, found, f"at most {BLUR_PX:g} px: exposure_s = {shorter_s:.4f}, more light"
-        )
+        yield Row("exposure", name, state, found, f"at most {BLUR_PX:g} px: exposure_s = {shorter_s:.4f}, more light")
 
 
 def _focal_px(calibration: RigCalibration, name: str, image: Image) -> float:

@@ -16,7 +16,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Self
+from typing import Any
 
 import cv2
 import numpy as np
@@ -91,7 +91,7 @@ class Recorder:
         for entry in rig.devices:
             self._make_lanes(entry)
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> Recorder:
         opened: list[Device] = []
         try:
             for device in self.devices.values():
@@ -299,7 +299,7 @@ class Recorder:
             rate = 100.0 if entry.kind == "arm" else entry.rate_hz
             self.lanes[topic] = Lane(topic, rate, r.queue_s, r.pre_trigger_s + hold_s, _bound(write, entry), hold_s)
             if entry.kind != "arm":
-                self._gates[topic] = Gate(topic, self.lanes[topic].counter)
+                self._gates[topic] = Gate(topic, self.lanes[topic].counter, period_ns=1e9 / entry.rate_hz)
 
     def _write_color(self, take: Take, entry: DeviceEntry, item: Item) -> int:
         image: Image = item.value[0]

@@ -57,13 +57,14 @@ def judge(
         if trouble.kind in FATAL_KINDS and trouble.level == "error":
             reasons.append(f"{FATAL_KINDS[trouble.kind]} ({trouble.device}: {trouble.text})")
     for topic, tally in counts.items():
-        lost = tally.dropped_total + tally.missed
-        whole = tally.received + tally.missed
+        again = tally.dropped.get("duplicate", 0)
+        lost = tally.dropped_total - again + tally.missed
+        whole = tally.received - again + tally.missed
         if tally.written == 0:
             reasons.append(f"{topic}: nothing was written")
         elif lost > config.most_lost_share * whole:
             reasons.append(f"{topic}: {lost} of {whole} lost {_causes(tally)}")
-        elif lost:
+        elif lost or again:
             warnings.append(f"{topic}: {lost} of {whole} lost {_causes(tally)}")
     if expects_toss:
         missing = [

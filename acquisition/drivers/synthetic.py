@@ -15,7 +15,7 @@ import threading
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, Self
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -94,7 +94,6 @@ class SyntheticConfig:
     """When the RGBD camera's 32-bit microseconds start over (negative: never in a session)."""
     gripper_delay_ms: float = 60.0
     gripper_delay_sigma_ms: float = 6.0
-    release_known: bool = True
     board_views: int = 24
     subframes: int = 1
 
@@ -183,7 +182,7 @@ class _Device:
         self.stop()
         self._open = False
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> Any:
         self.open()
         return self
 
@@ -191,7 +190,10 @@ class _Device:
         self.close()
 
     def health(self) -> Health:
-        return Health(received=dict(self._counts.received), dropped=dict(self._counts.dropped))
+        received, dropped = dict(self._counts.received), dict(self._counts.dropped)
+        if self._faults.active("unplug") is not None:
+            return Health("error", f"{self.name} was unplugged (simulated)", received, dropped)
+        return Health(received=received, dropped=dropped)
 
     def _described(self, model: str, rate_hz: float) -> dict[str, Any]:
         return {

@@ -1,0 +1,106 @@
+"""A small simulated lab whose pictures cost nothing, and one take recorded with it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from acquisition.clock import SessionClock
+from acquisition.drivers.synthetic import SyntheticConfig, SyntheticLab, SyntheticThrower
+from acquisition.operator import Nobody
+from acquisition.recorder import Recorder
+from acquisition.rig import DeviceEntry, RecordingConfig, Rig
+from acquisition.run import Options, SessionReport, SessionRun, TossReport
+from acquisition.streams import Tally
+from acquisition.verdict import Verdict
+from recordings.progress import Silent
+from recordings.session_writer import SessionWriter
+
+SMALL = SyntheticConfig(pictures="pool", color_size=(212, 120), mono_size=(160, 120), mono_cameras=1, wrap_after_s=-1.0)
+WARM_UP_S = 0.7
+
+
+class Deciding(Nobody):
+    """Keeps the recorder's verdict, never tries again, writes down what it is told."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.told: list[str] = []
+
+    def say(self, text: str) -> None:
+        self.told.append(text)
+
+    def decide(self, verdict: Verdict) -> Any:
+        return verdict.decision
+
+
+@dataclass
+class Recorded:
+    """What became of a session in a test."""
+
+    folder: Path
+    report: SessionReport
+    tallies: Mapping[str, Tally]
+    clocks: Mapping[str, Any]
+    operator: Deciding
+    seconds: float
+    lab: SyntheticLab = field(repr=False)
+
+    @property
+    def take(self) -> TossReport:
+        return self.report.takes[0]
+
+
+def small_rig(**recording: Any) -> Rig:
+    devices = (
+        DeviceEntry("d455", "rgbd", "synthetic"),
+        DeviceEntry("mono0", "mono", "synthetic"),
+        DeviceEntry("arm", "arm", "synthetic", rate_hz=1000.0),
+        DeviceEntry("gripper", "gripper", "synthetic", rate_hz=50.0),
+    )
+    config = replace(RecordingConfig(countdown_s=0.0, pre_trigger_s=0.3), **recording)
+    return Rig("small", devices, Path("small.toml"), "panda", recording=config)
+
+
+@pytest.fixture
+def record(tmp_path: Path) -> Callable[..., Recorded]:
+    """record(inject=lambda lab: lab.faults("d455").inject("gap", at_s=0.4)): takes of a second each, in `folder`."""
+
+    def run(
+        inject: Callable[[SyntheticLab], object] = lambda lab: None,
+        *,
+        seconds: float = 1.0,
+        tosses: int = 1,
+        name: str = "session",
+        config: SyntheticConfig = SMALL,
+        before: Callable[[SyntheticLab], object] = lambda lab: None,
+        operator: Deciding | None = None,
+        **recording: Any,
+    ) -> Recorded:
+        lab = SyntheticLab(config)
+        rig = small_rig(**recording)
+        thrower = SyntheticThrower(lab)
+        thrower.prepare(0, 0, Silent())
+        devices = {d.name: lab.device(d.name, d.kind, d.rate_hz) for d in rig.devices}
+        recorder = Recorder(rig, devices, SessionClock(time.monotonic_ns(), time.time_ns()))
+        operator = operator or Deciding()
+        folder = tmp_path / name
+        before(lab)
+        with recorder:
+            time.sleep(WARM_UP_S)
+            with SessionWriter(folder, {"object": {"name": "cube"}}, lab.show.calibration()) as session:
+                inject(lab)
+                started = time.monotonic()
+                whole = SessionRun(recorder, thrower, session, lab.show.calibration(), operator, Silent())
+                report = whole.record(Options(tosses, fixed_s=seconds))
+                took = time.monotonic() - started
+                session.finish("complete" if not report.stopped else "stopped", report.stopped)
+            clocks = recorder.clocks()
+        return Recorded(folder, report, recorder.tallies(), clocks, operator, took, lab)
+
+    return run
