@@ -20,10 +20,11 @@ import numpy as np
 import torch
 
 from processing.contact.evaluate import evaluate
+from processing.contact.from_tracks import learn_from_series
 from processing.contact.inertia import Physics, known_physics, uniform_physics
-from processing.contact.learn import ContactConfig, ContactLearning, Plane, learn_contact
+from processing.contact.learn import ContactLearning, Plane, learn_contact
 from processing.contact.motion import PoseSeries, rotation_matrices
-from processing.contact.prior import Prior, prior_from_shape, prior_from_size
+from processing.contact.prior import prior_from_size
 from recordings.tracks import ObjectShape
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -229,14 +230,14 @@ def shapes() -> None:
         rng = np.random.default_rng(0)
         bigger = 1.06 * (shape.vertices_m - physics.center_of_mass_m) + physics.center_of_mass_m
         start = replace(shape, vertices_m=bigger + 5e-4 * rng.standard_normal(shape.vertices_m.shape), source="vision")
-        geometry = "nonconvex" if name == "L-shape" else "hull"
-        prior: Prior = prior_from_shape(geometry, start, physics)
-        prior = replace(prior, measured=False)  # 6 % of 100 mm is more than the plane's check allows
-        learning = learn_contact(tracks[:16], prior, physics, config=ContactConfig())
+        learned = learn_from_series(tracks[:16], start, physics=physics)
+        learning = learned.fused
         done = evaluate(learning, tracks[16:])
+        hull = chamfer_m(learned.learning.shape, truth)
         line(
             name,
-            f"Chamfer {1e3 * chamfer_m(start, truth):.2f} -> {1e3 * chamfer_m(learning.shape, truth):.2f} mm; friction "
+            f"Chamfer {1e3 * chamfer_m(start, truth):.2f} -> {1e3 * chamfer_m(learned.shape, truth):.2f} mm (contact "
+            f"alone {1e3 * hull:.2f}); {learned.choice.name}; friction "
             f"{learning.friction.value:.3f} ({learning.friction.low:.3f} .. {learning.friction.high:.3f}), true "
             ".250; rollouts "
             f"{1e3 * done.position.mean:.1f} mm / {np.degrees(done.rotation.mean):.1f} deg on 8 unseen; fit "

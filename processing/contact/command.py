@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,10 +15,12 @@ from recordings.progress import Progress, Silent
 
 if TYPE_CHECKING:
     from processing.contact.motion import PoseSeries
+    from processing.truth import Truth
     from recordings.session import Session
     from recordings.tracks import ObjectShape
 
-STAGE, VERSION = "contact-only", 1
+STAGE, VERSION = "contact-only", 2
+CAMERA = "d455"
 DEFAULT_STEPS = 80
 MOST_TOSSES_LEARNED = 64
 """Learning from more is possible (--train), but gains nothing."""
@@ -54,6 +57,7 @@ def run(args: argparse.Namespace, session: Session, out_dir: Path, progress: Pro
         poses=args.poses,
         steps=args.steps,
         device=getattr(args, "device", "cpu") or "cpu",
+        truth=getattr(args, "truth", None),
         progress=progress,
     )
     return Outcome(document, text)
@@ -70,6 +74,7 @@ def contact_only(
     steps: int = DEFAULT_STEPS,
     device: str = "cpu",
     progress: Progress | None = None,
+    truth: Path | None = None,
 ) -> tuple[dict[str, Any], str]:
     """Learn from the tosses of `train`, roll out those of `test`, write stage, plot and assets into `out_dir`.
 
@@ -83,7 +88,7 @@ def contact_only(
         raise BadInput(f"--init {init_m}: wanted the side of a cube in metres, 0.005 to 1; for example --init 0.05")
     began = time.perf_counter()
     learned, tested = _split(session.tosses, train, test)
-    source = find_poses(session, out_dir, poses, sorted({*learned, *tested}))
+    source = find_poses(session, out_dir, poses, sorted({*learned, *tested}), truth)
     return run_stage(
         session, out_dir, source, learned, tested, geometry, init_m, steps, device, progress or Silent(), began
     )
@@ -121,14 +126,16 @@ def _span(there: Sequence[int]) -> str:
     return f"{len(there)} tosses, {there[0]} to {there[-1]}" if there else "no tosses"
 
 
-def find_poses(session: Session, out_dir: Path, poses: str | None, tosses: Sequence[int]) -> PoseSource:
-    """The tracks of some tosses: those of vision where the results folder holds them, else `/track/pose`, or the
+def find_poses(
+    session: Session, out_dir: Path, poses: str | None, tosses: Sequence[int], truth: Path | None = None
+) -> PoseSource:
+    """The poses of some tosses: those of vision where the results folder holds them, else `/track/pose`, or the
     truth."""
     from processing.contact.motion import PoseSeries
 
-    if poses == "truth":
-        return _truth_poses(session, tosses)
     vision = _vision(out_dir)
+    if poses == "truth":
+        return _truth_poses(session, tosses, truth, vision)
     if vision is not None:
         return vision
     found = {t: session.toss(t).poses("/track/pose") for t in tosses}
@@ -143,28 +150,66 @@ def find_poses(session: Session, out_dir: Path, poses: str | None, tosses: Seque
 
 
 class PoseSource:
-    """Where poses came from, the tracks, and the shape in their object frame where there is one."""
+    """Where poses came from, the poses, and the shape in their object frame where there is one."""
 
     def __init__(self, name: str, tracks: list[PoseSeries], shape: ObjectShape | None) -> None:
         self.name, self.tracks, self.shape = name, tracks, shape
 
 
-def _truth_poses(session: Session, tosses: Sequence[int]) -> PoseSource:
+def _truth_poses(session: Session, tosses: Sequence[int], given: Path | None, vision: PoseSource | None) -> PoseSource:
+    """True poses, in the truth's own object frame; vision's shape is brought into it where there is one."""
+    from processing.truth import open_truth
+
+    truth = open_truth(given, session, session.calibration)
+    if truth is None:
+        raise BadInput(
+            f"--poses truth: {session.path} has no truth/; give one by --truth DIR, or make it: `toss-truth SESSION`"
+        )
+    tracks = [t for toss in tosses if (t := _true_series(truth, session, toss)) is not None]
+    if not tracks:
+        raise BadInput(f"--poses truth: {truth.folder} has no poses of the tosses {list(tosses)}")
+    name = "truth (only because --poses truth asks for it)"
+    if vision is None or vision.shape is None:
+        return PoseSource(f"{name}; the origin of its object frame is taken for the centre of mass", tracks, None)
+    return PoseSource(name, tracks, _in_frame_of(tracks, vision))
+
+
+def _true_series(truth: Truth, session: Session, toss: int) -> PoseSeries | None:
     from processing.contact.motion import PoseSeries
+    from processing.truth import nowhere_track
     from recordings.session import Toss
     from recordings.session_writer import toss_name
 
-    folder = session.truth_folder
-    if folder is None:
-        raise BadInput(f"--poses truth: {session.path} has no truth/; make it with `toss-truth SESSION`")
-    tracks = []
-    for toss in tosses:
-        path = folder / f"{toss_name(toss)}.mcap"
-        if path.exists():
-            tracks.append(PoseSeries.from_poses(toss, Toss(path).poses("/groundtruth/pose")))
-    if not tracks:
-        raise BadInput(f"--poses truth: {folder} has no poses of the tosses {list(tosses)}")
-    return PoseSource("truth (only because --poses truth asks for it)", tracks, None)
+    own = truth.folder / f"{toss_name(toss)}.mcap"
+    if CAMERA not in session.calibration.cameras:
+        return PoseSeries.from_poses(toss, Toss(own).poses("/groundtruth/pose")) if own.exists() else None
+    empty = nowhere_track(toss, CAMERA, session.toss(toss).rgbd(CAMERA).times_ns)
+    poses = truth.camera_from_object(empty)
+    return None if poses is None else PoseSeries.from_camera(toss, empty.time_ns, poses, CAMERA, session.calibration)
+
+
+def _in_frame_of(tracks: Sequence[PoseSeries], vision: PoseSource) -> ObjectShape:
+    """Vision's shape in the truth's object frame: the median of truth_from_track over all frames that both have."""
+    import numpy as np
+    from scipy.spatial.transform import Rotation
+
+    estimated = {t.toss: t for t in vision.tracks}
+    turns, shifts = [], []
+    for true in tracks:
+        track = estimated.get(true.toss)
+        if track is None:
+            continue
+        for i, time_s in enumerate(track.time_s):
+            j = int(np.abs(true.time_s - time_s).argmin())
+            if abs(true.time_s[j] - time_s) < 1e-3:
+                turns.append(true.rotation[j].T @ track.rotation[i])
+                shifts.append(true.rotation[j].T @ (track.position_m[i] - true.position_m[j]))
+    if not turns or vision.shape is None:
+        raise BadInput("--poses truth: no frame has both a tracked and a true pose, so vision's shape cannot be moved")
+    turn, shift = Rotation.from_matrix(np.array(turns)).mean().as_matrix(), np.median(shifts, axis=0)
+    shape = vision.shape
+    moved = shape.vertices_m @ turn.T + shift
+    return replace(shape, object_frame="object", vertices_m=moved)
 
 
 def _vision(out_dir: Path) -> PoseSource | None:
@@ -175,9 +220,10 @@ def _vision(out_dir: Path) -> PoseSource | None:
     if not Results.is_results(out_dir):
         return None
     results = Results.open(out_dir)
-    for name in ("converged", "ours", "bundlesdf-10"):
+    for name in ("joint", "converged", "ours", "bundlesdf-10"):
         if (name, "all") in results.variants():
             record = results.find(name, "all")
             tracks = [PoseSeries.from_track(t, record.calibration) for t in results.tracks(name, "all").values()]
-            return PoseSource(f"track of variant {name}", tracks, results.shape(name, "all"))
+            usable = [t for t in tracks if len(t) >= 5]
+            return PoseSource(f"track of variant {name}", usable, results.shape(name, "all"))
     return None

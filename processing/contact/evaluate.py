@@ -13,7 +13,7 @@ from scipy.stats import t as student
 
 from processing.contact.learn import ContactLearning, Plane, Prepared, prepare, starts
 from processing.contact.motion import PoseSeries
-from processing.contact.rollout import RolloutErrors, Start, rollout_errors, simulate
+from processing.contact.rollout import Rollout, RolloutErrors, Start, rollout_errors, simulate
 
 FIGURE_4_STEPS = 99
 
@@ -68,6 +68,10 @@ class Evaluation:
     position: Summary
     rotation: Summary
     left_out: dict[int, str]
+    rolled: Rollout
+    start: Start
+    start_time_s: tuple[float, ...]
+    """Of the frame that each toss is rolled out from, since the toss's first frame."""
 
     def to_json(self) -> dict[str, Any]:
         return {
@@ -130,4 +134,21 @@ def evaluate_from(
         tracks = [moved[t.toss] for t in tracks]
         begin = [int(np.abs(t.time_s - at).argmin()) for t, at in zip(tracks, times)]
     errors = rollout_errors(rolled, tracks, begin, step_s)
-    return Evaluation(errors, summarise(errors.position_m), summarise(errors.rotation_rad), dict(prepared.left_out))
+    begun = tuple(float(t.time_s[b]) for t, b in zip(prepared.tracks, first))
+    position, rotation = summarise(errors.position_m), summarise(errors.rotation_rad)
+    return Evaluation(errors, position, rotation, dict(prepared.left_out), rolled, start, begun)
+
+
+def world_poses(learning: ContactLearning, done: Evaluation, plane: Plane) -> dict[int, Float[Array, "t 4 4"]]:
+    """`world_from_object` of every rollout: its start, then the pose after each step; as ghosts beside the tracks."""
+    world_from_level, frame = plane.level_from_world().T, learning.frame
+    found = {}
+    for i, toss in enumerate(done.errors.tosses):
+        rotation = np.concatenate([done.start.rotation[i : i + 1], done.rolled.rotation[i]])
+        position = np.concatenate([done.start.position_m[i : i + 1], done.rolled.position_m[i]])
+        poses = np.tile(np.eye(4), (len(rotation), 1, 1))
+        poses[:, :3, :3] = world_from_level @ rotation @ frame.axes.T
+        centers = (position + [0.0, 0.0, plane.offset_m]) @ world_from_level.T
+        poses[:, :3, 3] = centers - poses[:, :3, :3] @ frame.origin_object_m
+        found[toss] = poses
+    return found

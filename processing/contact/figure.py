@@ -27,26 +27,7 @@ def draw_result(
     figure = Figure(figsize=(12, 7.2), dpi=130, layout="constrained")
     FigureCanvasAgg(figure)
     grid = figure.add_gridspec(2, 6, height_ratios=(1.25, 1))
-    time_ms = 1e3 * evaluation.errors.step_s * np.arange(1, evaluation.errors.position_m.shape[1] + 1)
-    marked = np.isin(evaluation.errors.tosses, unlearned)
-    _errors(
-        figure.add_subplot(grid[0, :3]),
-        time_ms,
-        1e3 * evaluation.errors.position_m,
-        evaluation.position,
-        1e3,
-        marked,
-        "mm",
-    )
-    _errors(
-        figure.add_subplot(grid[0, 3:]),
-        time_ms,
-        np.degrees(evaluation.errors.rotation_rad),
-        evaluation.rotation,
-        180 / np.pi,
-        marked,
-        "deg",
-    )
+    draw_errors(figure.add_subplot(grid[0, :3]), figure.add_subplot(grid[0, 3:]), evaluation, unlearned)
     for column, (a, b) in enumerate(((0, 1), (0, 2), (1, 2))):
         _outline(figure.add_subplot(grid[1, column]), learning, a, b)
     _sweep(figure.add_subplot(grid[1, 3:5]), learning)
@@ -64,6 +45,15 @@ def draw_result(
     figure.savefig(path)
 
 
+def draw_errors(left: Any, right: Any, done: Evaluation, unlearned: tuple[int, ...], against: str = "") -> None:
+    """Position (left axes) and rotation errors of rollouts against time; tosses not learned from are marked."""
+    time_ms = 1e3 * done.errors.step_s * np.arange(1, done.errors.position_m.shape[1] + 1)
+    marked = np.isin(done.errors.tosses, unlearned)
+    _errors(left, time_ms, 1e3 * done.errors.position_m, done.position, 1e3, marked, "mm", against)
+    degrees = np.degrees(done.errors.rotation_rad)
+    _errors(right, time_ms, degrees, done.rotation, 180 / np.pi, marked, "deg", against)
+
+
 def _plain(axes: Any) -> None:
     for side in ("top", "right"):
         axes.spines[side].set_visible(False)
@@ -78,6 +68,7 @@ def _errors(
     unit: float,
     marked: Any,
     name: str,
+    against: str = "",
 ) -> None:
     both = bool(marked.any() and not marked.all())
     for row, special in zip(errors, marked):
@@ -98,7 +89,7 @@ def _errors(
         float(np.nanmax(unit * summary.curve_high)),
     )
     axes.set(xlim=(0, time_ms[-1]), ylim=(0, 1.05 * top), xlabel="time since the start of the rollout, ms")
-    what = "position error, mm" if name == "mm" else "rotation error, deg"
+    what = ("position error, mm" if name == "mm" else "rotation error, deg") + (f" {against}" if against else "")
     axes.set_title(
         f"{what}: mean {unit * summary.mean:.1f} ({unit * summary.low:.1f} .. {unit * summary.high:.1f})",
         fontsize=10,

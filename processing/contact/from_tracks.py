@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -21,7 +21,7 @@ from processing.contact.inertia import Physics, uniform_physics
 from processing.contact.judge import losses_of, mean_loss_j, series_of, usable
 from processing.contact.learn import ContactConfig, ContactLearning, Plane, learn_contact, results_of
 from processing.contact.loss import REFERENCE_MASS_KG, contact_loss, find_contacts, point_velocity
-from processing.contact.motion import GRAVITY_M_S2
+from processing.contact.motion import GRAVITY_M_S2, PoseSeries
 from processing.contact.prior import Prior
 from processing.contact.result import result_document, warnings_of
 from recordings.errors import BadInput
@@ -89,13 +89,27 @@ def learn_from_tracks(
     `physics` None: unit mass, uniform density over the mesh. `plane` None: z = 0 of `world`.
     Raises BadInput for tracks without contact, a plane that contradicts what the camera saw, other object frames.
     """
-    torch.set_num_threads(1)  # the batches are small: more threads only wait for each other
-    plane, config, progress = plane or Plane(), config or TracksConfig(), progress or Silent()
+    config = config or TracksConfig()
     _check_frames(tracks, shape, world_from_camera)
     left_out = usable(list(tracks.values()), config.least_tracked)
     series = [s for s in series_of(tracks, world_from_camera) if s.toss not in left_out]
     if not series:
         raise BadInput("no toss can be learned from: " + "; ".join(f"toss {t}: {why}" for t, why in left_out.items()))
+    return learn_from_series(series, shape, plane, physics, config, progress, left_out)
+
+
+def learn_from_series(
+    series: Sequence[PoseSeries],
+    shape: ObjectShape,
+    plane: Plane | None = None,
+    physics: Physics | None = None,
+    config: TracksConfig | None = None,
+    progress: Progress | None = None,
+    left_out: Mapping[int, str] | None = None,
+) -> TrackLearning:
+    """The same from `world_from_object` poses in the object frame of the shape."""
+    torch.set_num_threads(1)  # the batches are small: more threads only wait for each other
+    plane, config, progress = plane or Plane(), config or TracksConfig(), progress or Silent()
     physics = physics or uniform_physics(shape)
     sigmas = (config.held_seen_m, config.held_unseen_m)
     choice = choose_geometry(series, shape, physics, plane, config.contact, sigmas, config.geometry)
@@ -112,7 +126,7 @@ def learn_from_tracks(
     rollouts = evaluate(
         fused, series, plane, FIGURE_4_STEPS, config.contact.rollout_step_s, "release", ready=learning.prepared
     )
-    left_out = {**left_out, **learning.left_out}
+    left_out = {**(left_out or {}), **learning.left_out}
     length = np.linalg.norm(moved, axis=1)
     document = _document(learning, fused, rollouts, prior, choice, readings, sizes, length, shape, left_out, plane)
     return TrackLearning(

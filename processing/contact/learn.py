@@ -25,7 +25,7 @@ from processing.contact.unexplained import unexplained_rows
 from processing.contact.weights import HeldOut, Sweep, SweepConfig, sweep_weights
 from recordings.errors import BadInput
 from recordings.progress import Progress, Silent
-from recordings.tracks import ContactModel, ObjectShape
+from recordings.tracks import ContactModel, ObjectShape, RigCalibration
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +46,21 @@ class Plane:
             raise BadInput(f"the plane's normal {n.tolist()} points down; wanted up, against gravity")
         K = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
         return np.eye(3) + K + K @ K / (1 + cosine)
+
+
+def calibrated_plane(calibration: RigCalibration) -> Plane:
+    """`residuals["table"]` of a calibration: {normal_world, offset_m, std_m, source}; z = 0 of `world` where it is not
+    there. Raises BadInput for a table that is no plane."""
+    given = (calibration.residuals or {}).get("table")
+    if not isinstance(given, Mapping) or "normal_world" not in given or "offset_m" not in given:
+        return Plane(source="z = 0 of world (the calibration has no table)")
+    normal = np.array(given["normal_world"], dtype=np.float64)
+    if normal.shape != (3,) or not np.isfinite(normal).all() or not np.linalg.norm(normal) > 0.5:
+        raise BadInput(f"calibration: residuals.table.normal_world is {given['normal_world']}; wanted a unit vector")
+    length = float(np.linalg.norm(normal))
+    std = given.get("std_m")
+    source = f"calibration.json: table ({given.get('source', 'no source given')})"
+    return Plane(normal / length, float(given["offset_m"]) / length, source, None if std is None else float(std))
 
 
 @dataclass(frozen=True)

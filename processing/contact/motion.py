@@ -104,17 +104,32 @@ class PoseSeries:
     @staticmethod
     def from_track(track: ObjectTrack, calibration: RigCalibration) -> PoseSeries:
         """A track in its camera moved to the world. Raises BadInput where the calibration does not know the camera."""
-        world_from_camera = calibration.transform("world", track.camera).matrix
-        kept = ~track.lost
-        return _from_matrices(track.toss, track.time_ns[kept], world_from_camera @ track.camera_from_object[kept])
+        return PoseSeries.from_camera(track.toss, track.time_ns, track.camera_from_object, track.camera, calibration)
+
+    @staticmethod
+    def from_camera(
+        toss: int,
+        time_ns: Int64[Array, " n"],
+        camera_from_object: Float[Array, "n 4 4"],
+        camera: str,
+        calibration: RigCalibration,
+    ) -> PoseSeries:
+        """Poses in a camera, NaN where there is none; times count from the first frame, with a pose or without."""
+        world_from_camera = calibration.transform("world", camera).matrix
+        kept = np.isfinite(camera_from_object).all(axis=(1, 2))
+        start = int(time_ns[0]) if len(time_ns) else 0
+        return _from_matrices(toss, time_ns[kept], world_from_camera @ camera_from_object[kept], start)
 
 
-def _from_matrices(toss: int, time_ns: Int64[Array, " n"], matrices: Float[Array, "n 4 4"]) -> PoseSeries:
+def _from_matrices(
+    toss: int, time_ns: Int64[Array, " n"], matrices: Float[Array, "n 4 4"], start_ns: int | None = None
+) -> PoseSeries:
     if not np.isfinite(matrices).all():
         bad = int(np.argmin(np.isfinite(matrices).all((1, 2))))
         raise BadInput(f"toss {toss}: the pose of frame {bad} is NaN but not marked lost; run the tracker again")
-    start = time_ns[0] if len(time_ns) else 0
-    return PoseSeries(toss, (time_ns - start) * 1e-9, matrices[:, :3, :3].copy(), matrices[:, :3, 3].copy())
+    if start_ns is None:
+        start_ns = int(time_ns[0]) if len(time_ns) else 0
+    return PoseSeries(toss, (time_ns - start_ns) * 1e-9, matrices[:, :3, :3].copy(), matrices[:, :3, 3].copy())
 
 
 def rotation_vectors(rotations: Float[Array, "*n 3 3"]) -> Float[Array, "*n 3"]:

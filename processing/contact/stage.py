@@ -13,23 +13,27 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
+from processing.contact.choice import CLASSES, ClassName
 from processing.contact.command import STAGE, VERSION, PoseSource
 from processing.contact.data_checks import duplicate_groups, refuse_leaks
-from processing.contact.evaluate import Evaluation, evaluate
+from processing.contact.evaluate import Evaluation, evaluate, world_poses
 from processing.contact.export import write_assets
 from processing.contact.figure import draw_result
 from processing.contact.fit import FitConfig
+from processing.contact.from_tracks import TracksConfig, learn_from_series
 from processing.contact.inertia import Physics, physics_of_session, uniform_box_physics, uniform_physics
-from processing.contact.learn import ContactConfig, ContactLearning, Plane, learn_contact
+from processing.contact.learn import ContactConfig, ContactLearning, Plane, calibrated_plane, learn_contact
 from processing.contact.motion import PoseSeries
 from processing.contact.prior import Prior, prior_from_shape, prior_from_size
 from processing.contact.result import result_document, result_text, warnings_of
 from processing.contact.segment import find_phases
+from processing.contact.support import CAP_M2
 from processing.stage import Store
 from recordings.errors import BadInput
 from recordings.progress import Progress
 from recordings.results import VariantRecord, write_contact, write_shape, write_variant
-from recordings.session_writer import write_json
+from recordings.session_writer import toss_name, write_json
+from recordings.tracks import ObjectShape
 
 if TYPE_CHECKING:
     from recordings.session import Session
@@ -51,6 +55,10 @@ def run_stage(
     began: float,
 ) -> tuple[dict[str, Any], str]:
     """Learn and roll out, or read what an equal run made. Returns the document and lines to read."""
+    if device == "cuda" and not torch.cuda.is_available():
+        raise BadInput(
+            "--device cuda: this PyTorch finds no CUDA device; leave --device out (cpu), or install its CUDA build"
+        )
     torch.set_num_threads(1)  # the batches are small: more threads only wait for each other, and cost CPU seconds
     tracks = {t.toss: t for t in source.tracks}
     missing = [t for t in (*learned, *tested) if t not in tracks]
@@ -61,11 +69,11 @@ def run_stage(
     refuse_leaks(learned, marked, duplicate_groups([tracks[t] for t in sorted({*learned, *tested})]))
     plane = session_plane(session)
     given = physics_of_session(session.start)
-    prior, physics = make_prior(geometry, init_m, source, given, [tracks[t] for t in learned], plane)
+    train = [tracks[t] for t in learned]
     config = ContactConfig(fit=FitConfig(device=device, friction_start=0.03), rollout_steps=steps)
 
     def compute(folder: Path) -> Mapping[str, Any]:
-        learning = learn_contact([tracks[t] for t in learned], prior, physics, plane, config, progress)
+        learning, shape, extra = _learn(train, geometry, init_m, source, given, plane, config, progress)
         evaluation = evaluate(learning, [tracks[t] for t in tested], plane, steps, STEP_S)
         document = result_document(learning, evaluation)
         document |= {
@@ -79,19 +87,26 @@ def run_stage(
             "warnings": warnings_of(learning),
             "seconds": time.perf_counter() - began,
             "cpu_seconds_total": time.process_time(),
+            **extra,
         }
-        _write(folder, session, learning, evaluation, marked, document)
+        _write(folder, session, learning, shape, evaluation, marked, document, plane)
         return {"text": result_text(learning, evaluation)}
 
     settings = {
         "train": list(learned),
         "test": list(tested),
-        "geometry": prior.geometry.name,
+        "geometry": geometry or "from the data",
         "init_m": init_m,
         "steps": steps,
         "device": device,
     }
-    done = Store(out_dir).run(STAGE, VERSION, settings, {"poses": _digest(tracks, learned, tested)}, compute)
+    done = Store(out_dir).run(
+        STAGE,
+        VERSION,
+        settings,
+        {"poses": _digest(tracks, learned, tested), "about": _about(source, given, plane)},
+        compute,
+    )
     document = json.loads((done.folder / "result.json").read_text())
     files = {
         "folder": str(done.folder),
@@ -111,15 +126,31 @@ def _write(
     folder: Path,
     session: Session,
     learning: ContactLearning,
+    shape: ObjectShape,
     evaluation: Evaluation,
     marked: tuple[int, ...],
     document: Mapping[str, Any],
+    plane: Plane,
 ) -> None:
     write_contact(folder, learning.model)
-    write_shape(folder, learning.shape)
-    write_assets(folder, learning.model, learning.shape)
+    write_shape(folder, shape)
+    write_assets(folder, learning.model, shape)
     draw_result(folder / "rollout.png", learning, evaluation, marked, session.name)
+    write_rollouts(folder, learning, evaluation, plane)
     write_json(folder / "result.json", _finite(document))
+
+
+def write_rollouts(folder: Path, learning: ContactLearning, evaluation: Evaluation, plane: Plane) -> Path:
+    """`rollouts.npz`: per toss `toss_XX.world_from_object` (t, 4, 4) and `toss_XX.time_s` (t,), which counts from the
+    toss's first pose; `toss` lists the numbers. What toss-view shows as a ghost beside the track."""
+    poses = world_poses(learning, evaluation, plane)
+    content: dict[str, Any] = {"format_version": np.array(1), "toss": np.array(sorted(poses))}
+    for toss, start_s in zip(evaluation.errors.tosses, evaluation.start_time_s):
+        content[f"{toss_name(toss)}.world_from_object"] = poses[toss]
+        content[f"{toss_name(toss)}.time_s"] = start_s + evaluation.errors.step_s * np.arange(len(poses[toss]))
+    path = folder / "rollouts.npz"
+    np.savez(path, **content)
+    return path
 
 
 def _finite(value: Any) -> Any:
@@ -162,11 +193,65 @@ def _digest(tracks: Mapping[int, PoseSeries], learned: Sequence[int], tested: Se
 
 
 def session_plane(session: Session) -> Plane:
-    """The ground plane of a session's calibration; z = 0 of `world` where none is given."""
-    given = (session.calibration.residuals or {}).get("ground_plane")
-    if isinstance(given, Mapping) and "normal_world" in given and "offset_m" in given:
-        return Plane(np.array(given["normal_world"], dtype=np.float64), float(given["offset_m"]), "calibration.json")
-    return Plane()
+    """The table that the session was calibrated with (`toss-calibrate table`); z = 0 of `world` where none is given."""
+    return calibrated_plane(session.calibration)
+
+
+def _about(source: PoseSource, given: Physics | None, plane: Plane) -> str:
+    """Fingerprint of what else decides the result: where the poses come from, the shape, the physics, the plane."""
+    content = hashlib.sha256(source.name.encode())
+    values = [plane.normal_world, np.array([plane.offset_m, plane.std_m or 0.0])]
+    if source.shape is not None:
+        values += [source.shape.vertices_m, source.shape.faces]
+    if given is not None:
+        values += [np.array(given.mass_kg), given.inertia_kgm2, given.center_of_mass_m]
+    for value in values:
+        content.update(np.ascontiguousarray(value).tobytes())
+    return content.hexdigest()
+
+
+def _learn(
+    train: Sequence[PoseSeries],
+    geometry: str | None,
+    init_m: float | None,
+    source: PoseSource,
+    given: Physics | None,
+    plane: Plane,
+    config: ContactConfig,
+    progress: Progress,
+) -> tuple[ContactLearning, ObjectShape, Mapping[str, Any]]:
+    """From vision's shape (corrected where contact knows better) or from a size alone; the shape, and what else the
+    document says."""
+    if source.shape is None or init_m is not None or geometry == "box":
+        prior, physics = make_prior(geometry, init_m, source, given, train, plane)
+        learning = learn_contact(train, prior, physics, plane, config, progress)
+        return learning, learning.shape, {}
+    base = TracksConfig()
+    wanted: ClassName | None = geometry if geometry in CLASSES else None
+    contact = replace(config, penetration=base.contact.penetration, bootstrap_repeats=base.contact.bootstrap_repeats)
+    physics = shape_physics(source.shape, given)
+    found = learn_from_series(
+        train, source.shape, plane, physics, replace(base, contact=contact, geometry=wanted), progress
+    )
+    extra = {k: found.document[k] for k in ("geometry_choice", "contact_alone", "fusion", "contact_loss_j")}
+    return found.fused, found.shape, extra
+
+
+def shape_physics(shape: ObjectShape, given: Physics | None) -> Physics:
+    """Physics in the object frame of vision's shape, which is not the frame that an inertia was given in: the mass is
+    taken, and the inertia where it is the same about all axes."""
+    uniform = uniform_physics(shape)
+    if given is None:
+        return uniform
+    moments = np.linalg.eigvalsh(given.inertia_kgm2)
+    scale = given.mass_kg / uniform.mass_kg
+    if moments[-1] < 1.02 * moments[0]:
+        center = f"{given.source}; centre of mass of uniform density"
+        return Physics(given.mass_kg, uniform.center_of_mass_m, given.inertia_kgm2, center)
+    why = (
+        f"mass of {given.source}, uniform density over the prior shape (the axes of the inertia given are not its axes)"
+    )
+    return Physics(given.mass_kg, uniform.center_of_mass_m, scale * uniform.inertia_kgm2, why)
 
 
 def make_prior(
@@ -177,15 +262,11 @@ def make_prior(
     tracks: Sequence[PoseSeries],
     plane: Plane,
 ) -> tuple[Prior, Physics]:
-    """What to start from: the vision shape, a cube of --init, or a cube as high as the object rests."""
+    """What to start from without vision's mesh: its bounding box, a cube of --init, or a cube as high as the object
+    rests."""
     if source.shape is not None and init_m is None:
-        physics = given or uniform_physics(source.shape)
-        physics = (
-            physics
-            if given is None
-            else replace(physics, center_of_mass_m=uniform_physics(source.shape).center_of_mass_m)
-        )
-        return prior_from_shape(geometry or "hull", source.shape, physics), physics  # type: ignore[arg-type]
+        physics = shape_physics(source.shape, given)
+        return prior_from_shape("box", source.shape, physics, cap_m2=CAP_M2), physics
     if geometry == "nonconvex":
         raise BadInput(
             "--geometry nonconvex needs a shape to start from (where contact never reaches, it stands); these "
