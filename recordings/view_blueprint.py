@@ -12,7 +12,7 @@ from recordings.view_arm import BASE
 from recordings.view_bodies import BODY, PATH
 from recordings.view_layers import ARM, DEPTH, EVENTS, FRAMES, HEALTH, MOTION, TIME, Clock, image_entity
 from recordings.view_scene import Body, Scene, root_poses
-from recordings.view_track import FIGURES, MODEL
+from recordings.view_track import FIGURES, MATCHES, MODEL
 
 ABOUT = "about"
 EYE_FROM_TARGET = np.array([1.0, -0.75, 0.6])
@@ -121,12 +121,22 @@ def _images(scene: Scene) -> rrb.Container | None:
     """Colour and depth in one row, the ground-truth cameras in the next."""
     cameras = sorted({name for toss in scene.tosses for name in _cameras(scene, toss)})
     mono = [name for name in cameras if _is_mono(scene, name)]
-    first = [rrb.Spatial2DView(origin=image_entity(scene, c), name=f"Colour of {c}") for c in cameras if c not in mono]
+    first = [
+        rrb.Spatial2DView(origin=image_entity(scene, c), name=f"Colour of {c}", overrides=_hidden_matches(scene, c))
+        for c in cameras
+        if c not in mono
+    ]
     if any(_has_depth(scene, toss) for toss in scene.tosses):
         first.append(rrb.Spatial2DView(origin=DEPTH.format("d455"), name="Depth"))
     second = [rrb.Spatial2DView(origin=image_entity(scene, name), name=name) for name in mono]
     rows = [rrb.Horizontal(*views) for views in (first, second) if views]
     return rrb.Vertical(*rows, row_shares=[3, 2][: len(rows)], name="Images") if rows else None
+
+
+def _hidden_matches(scene: Scene, camera: str) -> dict[str, rrb.EntityBehavior]:
+    """Matches cover the object: they wait for a click."""
+    paths = [MATCHES.format(image_entity(scene, camera), body.name) for body in scene.bodies if body.notes]
+    return {path: rrb.EntityBehavior(visible=False) for path in paths}
 
 
 def _is_mono(scene: Scene, camera: str) -> bool:
@@ -219,7 +229,10 @@ def _tracking_words(body: Body) -> list[str]:
         return lines
     lines += ["- **Second tab in 3D**: what its keyframes had seen of it so far, arrows from where they look."]
     if any(len(n.matches.frames) for n in body.notes.values()):
-        lines += ["- **Lines in the colour image**: feature matches with a keyframe; red ones do not fit the poses."]
+        lines += [
+            "- **Lines in the colour image** (hidden: click their eye in the list of entities): feature matches with a "
+            "keyframe; red ones do not fit the poses."
+        ]
     if any(len(n.rejected.frame) for n in body.notes.values()):
         lines += ["- **Grey axes**: poses that were tried and not taken, with what they cost."]
     return lines

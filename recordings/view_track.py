@@ -21,7 +21,7 @@ from recordings.view_layers import Clock, Thinned, image_entity, plotted
 from recordings.view_scene import Body, Color, Scene
 
 MODEL, SEEN, VIEWPOINTS = "model/{}", "model/{}/seen", "model/{}/keyframes"
-REJECTED, FIGURES = "world/rejected/{}", "track"
+REJECTED, FIGURES, MATCHES = "world/rejected/{}", "track", "{}/matches_{}"
 AGREES, STRAYS, TRIED = (70, 220, 110), (235, 70, 70), (170, 170, 170)
 MASK_OPACITY = 70
 CAMERA_M, AXES_M, MOST_REJECTED = 0.25, 0.03, 6
@@ -47,7 +47,7 @@ def log_tracking(clock: Clock, scene: Scene, body: Body, camera: str = "d455") -
     log_rejected(clock, scene, body, times_ns, notes.rejected, camera)
     model = scene.calibration.cameras.get(camera)
     if model is not None:
-        log_matches(clock, f"{image_entity(scene, camera)}/matches_{body.name}", times_ns, notes.matches, model)
+        log_matches(clock, MATCHES.format(image_entity(scene, camera), body.name), times_ns, notes.matches, model)
     if model is not None and masks is not None and len(masks) == len(times_ns):
         log_seen(clock, scene, body, model, masks, notes.keyframes, poses)
 
