@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from processing.contact.from_tracks import TracksConfig
 from processing.field.learn import LearnConfig
 from processing.given_masks import DEFAULT_MASKS, GivenMasks
+from processing.joint import JointConfig
 from processing.rig import RigSettings
 from processing.second_pass import CycleConfig
 from processing.segment.background import BackgroundSettings
@@ -29,5 +30,6 @@ class Config:
     register: RegisterConfig = field(default_factory=RegisterConfig)
     shape: LearnConfig = field(default_factory=LearnConfig)
     cycle: CycleConfig = field(default_factory=CycleConfig)
+    joint: JointConfig = field(default_factory=JointConfig)
     contact: TracksConfig = field(default_factory=TracksConfig)
     frame_to_model: FrameToModelSettings = field(default_factory=FrameToModelSettings)

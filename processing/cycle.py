@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from processing.dynamics import contact_stage
 from processing.icp import ShapeSurface
+from processing.joint_stage import joint_stage
 from processing.judge import Explained, explain, pooled
 from processing.second_pass import align_stage, input_keys, second_field, second_tracks
 from processing.stage import Counts, Done
@@ -61,6 +62,8 @@ def run_cycle(run: Run, variant: Variant, start: Pass, name: str) -> Pass:
     """A row of the table from its first pass on."""
     if variant.refined == "converged":
         return _until_converged(run, start, name)
+    if variant.refined == "joint":
+        return _joint(run, start, name)
     refined = with_contact(run, start, name) if variant.contact else start
     if variant.refined == "contact":
         return refined
@@ -112,6 +115,20 @@ def _until_converged(run: Run, start: Pass, name: str) -> Pass:
     return replace(
         best, passes=tuple(passes), notes=(*best.notes, f"not converged after {config.most_passes} passes of the cycle")
     )
+
+
+def _joint(run: Run, start: Pass, name: str) -> Pass:
+    """One pass of the cycle, then all terms in one objective; friction by contact learning at its poses and shape."""
+    begun = second_pass(run, with_contact(run, start, name), start.masks, name, icp=True)
+    shape = next(iter(begun.shapes.values()))
+    solved = joint_stage(run, begun.tracks, shape, start.masks)
+    tracks = dict.fromkeys(begun.tracks, solved)
+    learned = contact_stage(run, name, tracks, solved)
+    kept_out = learned.counts.get("kept_out")
+    notes = (f"{name}: contact learning was kept out: {kept_out}",) if kept_out else ()
+    ended = replace(begun, tracks=tracks, shapes=tracks, contact={} if kept_out else dict.fromkeys(tracks, learned),
+                    notes=(*start.notes, *notes))  # fmt: skip
+    return replace(ended, passes=(_told(run, begun, ended, start.masks, name),))
 
 
 def _told(run: Run, before: Pass, after: Pass, masks: Mapping[int, Done], name: str) -> dict[str, Any]:

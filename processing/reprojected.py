@@ -21,8 +21,8 @@ class RedrawConfig:
     """What the second pass is given for depth and mask."""
 
     depth: Depth = "filled"
-    """`rendered` (the paper): D'' is the shape's everywhere. `filled`: the camera's own depth stays where it agrees
-    with the shape, the shape fills what was hidden, missing or wrong."""
+    """`rendered` (the paper): D'' and M'' are the shape's everywhere. `filled`: what the camera measured of the object
+    stays, the shape fills what was hidden, missing or wrong."""
     agrees_m: float = 0.006
     """Raw depth nearer than this to the shape's is the object's own."""
     before_m: float = 0.015
@@ -53,13 +53,25 @@ def redraw(
     in_front = occluders(raw.depth_m, raw_mask, drawn, config.before_m)
     if config.occlusion == "subtract":
         drawn = reproject(renderer, camera_from_object, in_front, "subtract")
-    depth_m = drawn.depth_m
-    if config.depth == "filled":
-        own = raw_mask & (raw.depth_m > 0) & (np.abs(raw.depth_m - depth_m) < config.agrees_m)
-        depth_m = np.where(own, raw.depth_m, depth_m).astype(np.float32)
-    shown = replace(raw, depth_m=np.where(drawn.mask, depth_m, raw.depth_m).astype(np.float32))
-    shown = replace(shown, depth_time_ns=raw.time_ns)  # drawn at the colour's time
-    return Redrawn(shown, drawn.mask, drawn.mask & ~raw_mask)
+    if config.depth == "rendered":
+        mask, depth_m = drawn.mask, np.where(drawn.mask, drawn.depth_m, raw.depth_m)
+    else:
+        mask, depth_m = _filled(raw.depth_m, raw_mask, drawn, in_front, config)
+    shown = replace(raw, depth_m=depth_m.astype(np.float32), depth_time_ns=raw.time_ns)  # drawn at the colour's time
+    return Redrawn(shown, mask, mask & ~raw_mask)
+
+
+def _filled(
+    depth_m: Float32[Array, "h w"],
+    raw_mask: Bool[Array, "h w"],
+    drawn: Reprojection,
+    in_front: Bool[Array, "h w"],
+    config: RedrawConfig,
+) -> tuple[Bool[Array, "h w"], Float32[Array, "h w"]]:
+    """Where the camera saw past the shape, it is not there; what it saw of the object stays, also beside the shape."""
+    unknown = drawn.mask & ~raw_mask & ((depth_m == 0) | in_front)
+    wrong = raw_mask & drawn.mask & ((depth_m == 0) | (np.abs(depth_m - drawn.depth_m) > config.agrees_m))
+    return raw_mask | unknown, np.where(unknown | wrong, drawn.depth_m, depth_m).astype(np.float32)
 
 
 def occluders(

@@ -84,8 +84,8 @@ def test_what_a_hand_hides_is_filled_without_colour_or_cut_out(tiny_world: Any) 
     hidden = whole & ~mask
     assert hidden.sum() > 30
     filled = redraw(frame, mask, camera_from_object, renderer, RedrawConfig())
-    assert (filled.mask == whole).all()
-    assert filled.colorless[hidden].all()
+    assert (filled.mask & hidden).sum() > 0.9 * hidden.sum()
+    assert (filled.mask & ~mask == filled.colorless).all()
     cut = redraw(frame, mask, camera_from_object, renderer, RedrawConfig(occlusion="subtract"))
     assert (cut.mask & hidden).sum() < 0.1 * hidden.sum()
 
