@@ -14,8 +14,10 @@ from scipy.stats import t as student
 from processing.contact.learn import ContactLearning, Plane, Prepared, prepare, starts
 from processing.contact.motion import PoseSeries
 from processing.contact.rollout import Rollout, RolloutErrors, Start, rollout_errors, simulate
+from processing.contact.smooth import Smoothed
 
 FIGURE_4_STEPS = 99
+HELD_S = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,6 +83,7 @@ class Evaluation:
             "tosses": list(self.errors.tosses),
             "position_m": self.position.to_json(),
             "rotation_rad": self.rotation.to_json(),
+            "start_time_s": list(self.start_time_s),
             "tosses_per_step": self.position.count.astype(int).tolist(),
             "solver_failures": self.errors.failures,
             "left_out": {str(t): why for t, why in self.left_out.items()},
@@ -98,19 +101,26 @@ def evaluate(
     plane: Plane | None = None,
     steps: int = 80,
     step_s: float = 1 / 148,
-    begin: Literal["first", "release"] = "first",
+    begin: Literal["first", "thrown", "release"] = "first",
     against: Sequence[PoseSeries] | None = None,
     ready: Prepared | None = None,
 ) -> Evaluation:
     """Roll the learned model out from each toss's first frame (or its release) and compare with its track.
 
+    `thrown`: from the first frame, unless a hand holds the object for HELD_S or longer: then from the release.
     `against`: other poses of the same tosses and the same body (ground truth) to compare with instead. `ready`: the
     tracks as they were prepared before.
     """
     prepared = prepared_for(learning, tracks, plane or Plane()) if ready is None else ready
-    first = [0] * len(prepared.tracks) if begin == "first" else None
+    first = None if begin == "release" else [0 if begin == "first" else _thrown(s) for s in prepared.smoothed]
     start, frames = starts(prepared, step_s, learning.fitted.inertia_start_kgm2, first)
     return evaluate_from(learning, prepared, start, frames, steps, step_s, against, plane or Plane())
+
+
+def _thrown(smoothed: Smoothed) -> int:
+    release = smoothed.phases.release or 0
+    held_s = float(smoothed.states.time_s[release] - smoothed.states.time_s[0])
+    return release if held_s >= HELD_S else 0
 
 
 def evaluate_from(

@@ -74,7 +74,7 @@ def run_stage(
 
     def compute(folder: Path) -> Mapping[str, Any]:
         learning, shape, extra = _learn(train, geometry, init_m, source, given, plane, config, progress)
-        evaluation = evaluate(learning, [tracks[t] for t in tested], plane, steps, STEP_S)
+        evaluation = evaluate(learning, [tracks[t] for t in tested], plane, steps, STEP_S, "thrown")
         document = result_document(learning, evaluation)
         document |= {
             "session": session.name,
