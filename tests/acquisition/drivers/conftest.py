@@ -6,6 +6,7 @@ import itertools
 import os
 import shutil
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from pathlib import Path
 
 import pytest
@@ -40,22 +41,38 @@ def rtde() -> Iterator[tuple[str, Apart]]:
         yield address, simulator
 
 
+ADDRESSES = [f"127.0.0.{i}" for i in range(1, 5)]
+
+
+@contextmanager
+def _network(needs: str | None) -> Iterator[list[str]]:
+    """A network namespace with these addresses, for GigE Vision's broadcasts; skips where it cannot be had."""
+    if needs is not None and shutil.which(needs) is None:
+        pytest.skip(f"no {needs}: apt-get install aravis-tools")
+    with ExitStack() as stack:
+        try:
+            stack.enter_context(own_network(ADDRESSES))
+        except NotPermitted as refused:
+            pytest.skip(f"GigE Vision needs a network namespace: {refused}")
+        yield ADDRESSES
+
+
+@pytest.fixture(scope="session")
+def aravis_network() -> Callable[[], AbstractContextManager[list[str]]]:
+    """`with aravis_network() as addresses:` a network for simulated GigE cameras, where Aravis' fake is installed."""
+    return lambda: _network(PROGRAM)
+
+
 @pytest.fixture(scope="module")
 def loopback_network() -> Iterator[list[str]]:
-    """A network namespace with four loopback addresses, for GigE Vision's broadcasts."""
-    addresses = [f"127.0.0.{i}" for i in range(1, 5)]
-    network = own_network(addresses)
-    try:
-        network.__enter__()
-    except NotPermitted as refused:
-        pytest.skip(f"GigE Vision needs a network namespace: {refused}")
-    yield addresses
-    network.__exit__(None, None, None)
+    """Four loopback addresses in a network of this test module's own."""
+    with _network(None) as addresses:
+        yield addresses
 
 
 @pytest.fixture(scope="module")
 def aravis(loopback_network: list[str]) -> list[str]:
-    """The addresses for simulated GigE cameras, where Aravis is installed."""
+    """The same, where Aravis' fake camera is installed."""
     if shutil.which(PROGRAM) is None:
         pytest.skip(f"no {PROGRAM}: apt-get install aravis-tools")
     return loopback_network

@@ -5,14 +5,13 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import pytest
 
 from acquisition.devices import Arm, ArmSamples, DeviceLost, DeviceRefused, Gripper, MonoCamera, RgbdCamera, RgbdCapture
-from acquisition.simulators.apart import Apart
 from recordings.errors import DeviceNotFound
 
 PATIENCE_S = 5.0
@@ -34,12 +33,13 @@ class Backend:
     items: int = 8
 
 
-@pytest.fixture(scope="module")
-def d455(db3: Callable[..., Path]) -> Backend:
+@contextmanager
+def d455(ask: Callable[[str], Any]) -> Iterator[Backend]:
     from acquisition.drivers.d455 import D455Camera
 
+    db3 = ask("db3")
     whole, gap = db3("plain"), db3("gap", leave_out=range(8, 11))
-    return Backend(
+    yield Backend(
         make=lambda **given: D455Camera(file=whole, **given),
         protocol=RgbdCamera,
         lossy=lambda: D455Camera(file=gap),
@@ -47,13 +47,17 @@ def d455(db3: Callable[..., Path]) -> Backend:
     )
 
 
-@pytest.fixture(scope="module")
-def genicam(aravis: list[str]) -> Iterator[Backend]:
+@contextmanager
+def genicam(ask: Callable[[str], Any]) -> Iterator[Backend]:
     from acquisition.drivers.genicam import GenicamCamera, GenicamSettings
     from acquisition.simulators.gige import FakeGvCamera
 
     settings = GenicamSettings(width=320, height=240, rate_hz=50.0, packet_bytes=1400)
-    with FakeGvCamera(aravis[0], "GV01") as whole, FakeGvCamera(aravis[1], "GV02", lost_per_mille=20):
+    with (
+        ask("aravis_network")() as addresses,
+        FakeGvCamera(addresses[0], "GV01") as whole,
+        FakeGvCamera(addresses[1], "GV02", lost_per_mille=20),
+    ):
         yield Backend(
             make=lambda serial="GV01": GenicamCamera(serial=serial, settings=settings),
             protocol=MonoCamera,
@@ -62,11 +66,11 @@ def genicam(aravis: list[str]) -> Iterator[Backend]:
         )
 
 
-@pytest.fixture(scope="module")
-def franka(fci: tuple[str, Apart]) -> Iterator[Backend]:
+@contextmanager
+def franka(ask: Callable[[str], Any]) -> Iterator[Backend]:
     from acquisition.drivers.franka import FrankaArm
 
-    address, simulator = fci
+    address, simulator = ask("fci")
 
     def lossy() -> FrankaArm:
         simulator.inject("lost_packets", share=0.1)
@@ -77,11 +81,11 @@ def franka(fci: tuple[str, Apart]) -> Iterator[Backend]:
     simulator.clear("lost_packets")
 
 
-@pytest.fixture(scope="module")
-def franka_hand(fci: tuple[str, Apart]) -> Iterator[Backend]:
+@contextmanager
+def franka_hand(ask: Callable[[str], Any]) -> Iterator[Backend]:
     from acquisition.drivers.franka_hand import FrankaHand
 
-    address, simulator = fci
+    address, simulator = ask("fci")
 
     def lossy() -> FrankaHand:
         simulator.inject("gripper_freeze", at_s=1.0, for_s=0.4)
@@ -93,11 +97,11 @@ def franka_hand(fci: tuple[str, Apart]) -> Iterator[Backend]:
     simulator.clear("gripper_unplug")
 
 
-@pytest.fixture(scope="module")
-def ur(rtde: tuple[str, Apart]) -> Iterator[Backend]:
+@contextmanager
+def ur(ask: Callable[[str], Any]) -> Iterator[Backend]:
     from acquisition.drivers.ur import UrArm
 
-    address, simulator = rtde
+    address, simulator = ask("rtde")
 
     def lossy() -> UrArm:
         simulator.inject("freeze", at_s=1.6, for_s=0.2)
@@ -107,7 +111,8 @@ def ur(rtde: tuple[str, Apart]) -> Iterator[Backend]:
     simulator.clear("unplug")
 
 
-def synthetic(name: str, kind: str, protocol: Any, rate_hz: float = 30.0) -> Backend:
+@contextmanager
+def synthetic(name: str, kind: str, protocol: Any, rate_hz: float = 30.0) -> Iterator[Backend]:
     """A device of the simulated lab, showing ready-made pictures."""
     from acquisition.drivers.synthetic import SyntheticConfig, SyntheticLab, SyntheticThrower
     from recordings.progress import Silent
@@ -121,40 +126,31 @@ def synthetic(name: str, kind: str, protocol: Any, rate_hz: float = 30.0) -> Bac
         return lab.device(name, kind, rate_hz)
 
     def lossy() -> Any:
-        lab.faults(name).inject("gap", at_s=0.2, for_s=0.2)
+        if kind == "gripper":
+            pytest.skip("the simulated fingers lose no state")
+        lab.faults(name).inject("silence" if kind == "arm" else "gap", at_s=0.2, for_s=0.2)
         return make()
 
-    return Backend(make, protocol, lossy, lambda: lab.faults(name).inject("unplug"))
+    yield Backend(make, protocol, lossy, lambda: lab.faults(name).inject("unplug"))
 
 
-@pytest.fixture(scope="module")
-def synthetic_rgbd() -> Backend:
-    return synthetic("d455", "rgbd", RgbdCamera)
+BACKENDS: dict[str, Callable[[Callable[[str], Any]], AbstractContextManager[Backend]]] = {
+    "d455": d455,
+    "genicam": genicam,
+    "franka": franka,
+    "franka_hand": franka_hand,
+    "ur": ur,
+    "synthetic_rgbd": lambda ask: synthetic("d455", "rgbd", RgbdCamera),
+    "synthetic_mono": lambda ask: synthetic("mono0", "mono", MonoCamera),
+    "synthetic_arm": lambda ask: synthetic("arm", "arm", Arm, 1000.0),
+    "synthetic_gripper": lambda ask: synthetic("gripper", "gripper", Gripper),
+}
 
 
-@pytest.fixture(scope="module")
-def synthetic_mono() -> Backend:
-    return synthetic("mono0", "mono", MonoCamera)
-
-
-@pytest.fixture(scope="module")
-def synthetic_arm() -> Backend:
-    return synthetic("arm", "arm", Arm, 1000.0)
-
-
-@pytest.fixture(scope="module")
-def synthetic_gripper() -> Backend:
-    return synthetic("gripper", "gripper", Gripper)
-
-
-REAL = ["d455", "genicam", "franka", "franka_hand", "ur"]
-SIMULATED = ["synthetic_rgbd", "synthetic_mono", "synthetic_arm", "synthetic_gripper"]
-
-
-@pytest.fixture(scope="module", params=[*REAL, *SIMULATED])
-def backend(request: pytest.FixtureRequest) -> Backend:
-    made: Backend = request.getfixturevalue(request.param)
-    return made
+@pytest.fixture(scope="module", params=list(BACKENDS))
+def backend(request: pytest.FixtureRequest) -> Iterator[Backend]:
+    with BACKENDS[request.param](request.getfixturevalue) as made:
+        yield made
 
 
 @pytest.fixture(scope="module")
