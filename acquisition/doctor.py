@@ -5,11 +5,11 @@ from __future__ import annotations
 import importlib.util
 import os
 import shutil
-import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
 from acquisition.preflight import Preflight, Row
+from recordings.errors import DeviceNotFound
 
 USBFS = Path("/sys/module/usbcore/parameters/usbfs_memory_mb")
 USBFS_MB = 1000
@@ -41,14 +41,12 @@ def packages() -> Iterator[Row]:
 
 def realsense() -> Iterator[Row]:
     """Cameras that librealsense sees, and whether this user may open them."""
-    if importlib.util.find_spec("pyrealsense2") is None:
-        return
-    import pyrealsense2 as rs
+    from acquisition.drivers.realsense_setup import connected
 
-    found = [
-        f"{d.get_info(rs.camera_info.name)} serial {d.get_info(rs.camera_info.serial_number)}"
-        for d in rs.context().query_devices()
-    ]
+    try:
+        found = connected()
+    except DeviceNotFound:
+        return  # `packages` has said so
     for text in found:
         yield Row("camera", "realsense", "ok", text)
     if not found:
@@ -61,18 +59,16 @@ def realsense() -> Iterator[Row]:
 
 def genicam() -> Iterator[Row]:
     """Aravis, and the cameras that it sees."""
-    tool = next((t for t in ("arv-tool-0.8", "arv-tool-0.10") if shutil.which(t)), None)
-    if tool is None:
-        fix = "apt-get install -y aravis-tools gir1.2-aravis-0.8"
+    from acquisition.drivers.genicam_setup import connected
+
+    try:
+        lines = connected()
+    except DeviceNotFound:
+        fix = "apt-get install -y --no-install-recommends libaravis-0.8-0"
         yield Row("package", "aravis", "warning", "not installed: PointGrey/FLIR and other GenICam cameras", fix)
         return
-    try:
-        listed = subprocess.run([tool], capture_output=True, text=True, timeout=10, check=False).stdout
-    except subprocess.TimeoutExpired:
-        listed = ""
-    lines = [line for line in listed.splitlines() if line.strip() and "No device" not in line]
     for line in lines:
-        yield Row("camera", "genicam", "ok", line.strip())
+        yield Row("camera", "genicam", "ok", line)
     if not lines:
         fix = "camera and computer in one network (GigE), or USB3 with a udev rule for its vendor"
         yield Row("camera", "genicam", "warning", "none found", fix)

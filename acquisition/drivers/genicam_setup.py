@@ -38,6 +38,11 @@ class GenicamSettings:
     buffers: int = 16
 
 
+def connected() -> list[str]:
+    """The cameras that Aravis sees, in words. Raises DeviceNotFound where it is not installed."""
+    return [str(found) for found in Aravis.get().found()]
+
+
 def apply(aravis: Aravis, camera: int, settings: GenicamSettings, warnings: list[str]) -> dict[str, Any]:
     """Set everything; what the camera granted. Raises AravisError or DeviceRefused."""
     if settings.width is not None and settings.height is not None:

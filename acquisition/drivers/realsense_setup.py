@@ -59,6 +59,13 @@ def find_serial(rs: Any, context: Any, name: str, serial: str | None) -> str:
     return serial
 
 
+def connected() -> list[str]:
+    """The RealSense cameras that the SDK sees, in words. Raises DeviceNotFound where it is not installed."""
+    rs = parts.sdk()
+    info = rs.camera_info
+    return [f"{d.get_info(info.name)} serial {d.get_info(info.serial_number)}" for d in rs.context().query_devices()]
+
+
 def cannot_do(rs: Any, context: Any, name: str, serial: str, wanted: D455Settings, error: RuntimeError) -> str:
     """Why the SDK resolves no streams for these settings, and what the camera can do."""
     for device in context.query_devices():
