@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import importlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -37,9 +38,10 @@ def _add(commands: Any, name: str, description: str, work: str, *examples: str) 
 
 def _work(name: str) -> Callable[[argparse.Namespace], Outcome]:
     def work(args: argparse.Namespace) -> Outcome:
-        from calibration import commands
-
-        done = getattr(commands, name)(args.session, args, progress_for("toss-calibrate"))
+        module, function = name.split(":")
+        done = getattr(importlib.import_module(f"calibration.{module}"), function)(
+            args.session, args, progress_for("toss-calibrate")
+        )
         return Outcome(done.document, done.text, FELL_SHORT if done.refused else DONE)
 
     return work
@@ -50,7 +52,7 @@ def _intrinsics(commands: Any) -> None:
         commands,
         "intrinsics",
         "Lenses of all cameras from the board views of calibration.mcap.",
-        "intrinsics",
+        "commands:intrinsics",
         "toss-calibrate intrinsics sessions/cube --camera mono0",
     )
     parser.add_argument("--camera", action="append", help="only this camera (may be given again)")
@@ -67,7 +69,7 @@ def _cameras(commands: Any) -> None:
         commands,
         "cameras",
         "Where all cameras stand to the D455: one bundle adjustment over board views, or over the tagged object.",
-        "cameras",
+        "commands:cameras",
         "toss-calibrate cameras sessions/cube",
         "toss-calibrate cameras sessions/cube --from object --tag-size 0.0614",
     )
@@ -81,7 +83,7 @@ def _hand_eye(commands: Any) -> None:
         commands,
         "hand-eye",
         "Where a camera stands to the robot, from board views with joint states.",
-        "hand_eye",
+        "commands:hand_eye",
         "toss-calibrate hand-eye sessions/cube --mounting eye-to-hand",
     )
     parser.add_argument(
@@ -98,7 +100,7 @@ def _table(commands: Any) -> None:
         commands,
         "table",
         "The table's plane from the tags on it and from depth, tied together; gravity from flight where tags show it.",
-        "table",
+        "commands_table:table",
         "toss-calibrate table sessions/cube",
     )
     parser.add_argument(
@@ -112,7 +114,7 @@ def _time(commands: Any) -> None:
         commands,
         "time",
         "Clock offsets of the ground-truth cameras and the arm against the D455, from the motion in all tosses.",
-        "time",
+        "commands_toss:time",
         "toss-calibrate time sessions/cube --tag-size 0.0614",
     )
     _object_arguments(parser)

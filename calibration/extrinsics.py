@@ -166,28 +166,31 @@ class _Setup:
         )
 
 
+def still_view(looks: Sequence[TargetView]) -> TargetView | None:
+    """What all images of a camera show of something that stands still, as one view: each point's median place, as sure
+    as in one image (the same pixels err alike in every image). None where nothing is seen in half of them."""
+    looks = [view for view in looks if len(view)]
+    if not looks:
+        return None
+    ids = np.concatenate([v.ids for v in looks])
+    points, pixels, covariance = (
+        np.concatenate([getattr(v, part) for v in looks]) for part in ("points_m", "pixels", "covariance_px2")
+    )
+    known = [i for i in np.unique(ids).tolist() if (ids == i).sum() >= 0.5 * len(looks)]
+    if not known:
+        return None
+    rows = [ids == i for i in known]
+    return TargetView(
+        np.array(known),
+        np.array([points[r][0] for r in rows]),
+        np.array([np.median(pixels[r], axis=0) for r in rows]),
+        np.array([covariance[r].mean(axis=0) for r in rows]),
+    )
+
+
 def _still(names: Sequence[str], table: Mapping[str, Sequence[TargetView]] | None) -> dict[str, TargetView]:
-    """What all images of a camera show of the table, as one view: each point's mean, as sure as in one image (the same
-    pixels give the same error in every image)."""
-    out = {}
-    for name in names if table else ():
-        looks = [view for view in (table or {}).get(name, ()) if len(view)]
-        if not looks:
-            continue
-        ids = np.concatenate([v.ids for v in looks])
-        points, pixels, covariance = (
-            np.concatenate([getattr(v, part) for v in looks]) for part in ("points_m", "pixels", "covariance_px2")
-        )
-        known = [i for i in np.unique(ids) if (ids == i).sum() >= 0.5 * len(looks)]
-        if known:
-            rows = [ids == i for i in known]
-            out[name] = TargetView(
-                np.array(known),
-                np.array([points[r][0] for r in rows]),
-                np.array([np.median(pixels[r], axis=0) for r in rows]),
-                np.array([covariance[r].mean(axis=0) for r in rows]),
-            )
-    return out
+    found = {name: still_view(table.get(name, ())) for name in names} if table else {}
+    return {name: view for name, view in found.items() if view is not None}
 
 
 def _table_or_not(setup: _Setup) -> tuple[list[Finding], _Setup]:

@@ -15,7 +15,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Float, Float32
 from numpy import ndarray as Array
 
 from calibration.bundle import Observations, Scene, Solved, adjust
@@ -39,7 +39,8 @@ SCALE_SIGMA = 0.01
 NEAR_M = 0.03
 RANSAC_ROUNDS = 200
 GRAVITY_DEG = 1.0
-LEAST_FLIGHT = 5
+LEAST_FLIGHT = 7
+FLIGHT_RMS_M = 0.0012
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +65,7 @@ def place_world(
     models: Mapping[str, CameraModel],
     camera_from_rig: Mapping[str, Float[Array, "4 4"]],
     views: Mapping[str, TargetView],
-) -> tuple[Solved, Observations, tuple[str, ...]]:
+) -> Solved:
     """rig_from_world from the table's tags at their given places (points of the views are in the world), seen by
     calibrated cameras. Raises BadInput where no camera sees enough of them."""
     names = tuple(n for n in models if n in views and len(views[n]) >= 4 and n in camera_from_rig)
@@ -92,7 +93,7 @@ def place_world(
     scene = Scene(
         tuple(models[n] for n in names), cameras, start[None], one, no, np.ones(1, dtype=bool), off, no, np.ones(1), off
     )
-    return adjust(scene, seen), seen, names
+    return adjust(scene, seen)
 
 
 def fit_table(
@@ -246,19 +247,50 @@ class Gravity:
     frames: int
 
 
-def gravity_from_flight(course: Path3, in_flight: Bool[Array, " n"]) -> Gravity:
-    """From a parabola through the centre's positions in free flight. Raises BadInput for too short a flight."""
-    if in_flight.sum() < LEAST_FLIGHT:
-        raise BadInput(f"{int(in_flight.sum())} frames of free flight; wanted {LEAST_FLIGHT} or more")
-    t = course.time_s[in_flight] - course.time_s[in_flight].mean()
-    A = np.stack([np.ones_like(t), t, 0.5 * t * t], -1)
-    fit, *_ = np.linalg.lstsq(A, course.position_m[in_flight], rcond=None)
-    left = course.position_m[in_flight] - A @ fit
-    sigma = float(np.sqrt((left**2).sum() / max(1, 3 * (len(t) - 3))))
-    acceleration = fit[2]
-    size = float(np.linalg.norm(acceleration))
-    std = sigma * float(np.sqrt(np.linalg.inv(A.T @ A)[2, 2])) / size
-    return Gravity(acceleration / size, float(np.degrees(std * np.sqrt(2))), size, int(in_flight.sum()))
+def gravity_from_flight(course: Path3, flight: slice) -> Gravity:
+    """From positions in free flight, p + R c = a + v t + g t^2 / 2: with rotations the centre of mass c of the body is
+    found too (the tracked point need not be it). Raises BadInput for too short a flight."""
+    found, left = _ballistic(course, flight)
+    acceleration, size = found[6:9], float(np.linalg.norm(found[6:9]))
+    spare = max(1, left.size - len(found))
+    A = _ballistic_matrix(course, flight)
+    covariance = float((left**2).sum()) / spare * np.linalg.pinv(A.T @ A)[6:9, 6:9]
+    across = np.eye(3) - np.outer(acceleration, acceleration) / size**2
+    std = float(np.sqrt(np.trace(across @ covariance @ across))) / size
+    return Gravity(acceleration / size, float(np.degrees(std)), size, len(left))
+
+
+def find_flight(course: Path3) -> slice | None:
+    """The longest stretch that a parabola explains to a millimetre with about the right acceleration; None without."""
+    count, best = len(course.time_s), None
+    for start in range(count - LEAST_FLIGHT):
+        for stop in range(count, start + LEAST_FLIGHT, -1):
+            if best is not None and stop - start <= best.stop - best.start:
+                break
+            found, left = _ballistic(course, slice(start, stop))
+            right_size = 0.8 < np.linalg.norm(found[6:9]) / GRAVITY_M_S2 < 1.2
+            if right_size and np.sqrt((left**2).mean()) < FLIGHT_RMS_M:
+                best = slice(start, stop)
+                break
+    return best
+
+
+def _ballistic(course: Path3, flight: slice) -> tuple[Array, Float[Array, "n 3"]]:
+    count = len(course.time_s[flight])
+    if count < LEAST_FLIGHT:
+        raise BadInput(f"{count} frames of free flight; wanted {LEAST_FLIGHT} or more")
+    A, places = _ballistic_matrix(course, flight), course.position_m[flight].ravel()
+    found = np.linalg.lstsq(A, places, rcond=None)[0]
+    return found, (places - A @ found).reshape(-1, 3)
+
+
+def _ballistic_matrix(course: Path3, flight: slice) -> Float[Array, "m k"]:
+    """Columns a, v, g, and c where rotations are known."""
+    t = course.time_s[flight] - course.time_s[flight].mean()
+    parts = [np.kron(factor[:, None], np.eye(3)) for factor in (np.ones_like(t), t, 0.5 * t * t)]
+    if course.rotation is not None:
+        parts.append(-course.rotation[flight].reshape(-1, 3))
+    return np.hstack(parts)
 
 
 def judge_table(

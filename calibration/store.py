@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -39,13 +38,15 @@ def updated(
 
 
 def write(session: Session, calibration: RigCalibration, kind: str, report: Report, **more: Any) -> Path:
-    """calibration.json with the report under `residuals[kind]`, whole or not at all; the manifest is renewed."""
-    entry = {**report.to_json(), "created_unix_s": time.time(), **more}
+    """calibration.json with the report under `residuals[kind]`."""
+    return write_entry(session, calibration, kind, {**report.to_json(), "created_unix_s": time.time(), **more})
+
+
+def write_entry(session: Session, calibration: RigCalibration, kind: str, entry: Mapping[str, Any]) -> Path:
+    """Whole or not at all; the manifest is renewed."""
     path = session.path / "calibration.json"
-    residuals = {**calibration.residuals, kind: entry}
-    document = replace(calibration, residuals=residuals).to_json()
-    json.dumps(document, allow_nan=False)
-    write_json(path, document)
+    residuals = {**calibration.residuals, kind: dict(entry)}
+    write_json(path, replace(calibration, residuals=residuals).to_json())
     renew(session.path, path.name)
     return path
 

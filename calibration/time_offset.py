@@ -17,6 +17,7 @@ from numpy import ndarray as Array
 from scipy.spatial.transform import Rotation, Slerp
 
 from calibration.extrinsics import whitening
+from calibration.pnp import most_agreed, poses_of_points
 from calibration.poses import exp_poses
 from calibration.report import Finding, Report, limit
 from calibration.targets import TargetView
@@ -32,6 +33,8 @@ SEARCH_S = 0.1
 FINEST_S = 1e-6
 RIG_TURN, RIG_SHIFT_M = 0.003, 0.003
 """How far calibration may be off (standard deviations) while the offset is found."""
+OPEN_TURN, OPEN_SHIFT_M = 0.1, 0.1
+"""The same where only a rough place is known."""
 POINT_M, FRAME_TURN, FRAME_SHIFT_M = 0.1, 0.02, 0.02
 """The same between two courses: another point of the body, another frame."""
 HUBER = 2.5
@@ -121,7 +124,7 @@ def offset_of_paths(reference: Path3, other: Path3) -> TimeOffset:
         return 1e3 * (turned - other.position_m)
 
     weight = 1.0 / np.array([POINT_M] * 3 + [FRAME_TURN] * 3 + [FRAME_SHIFT_M] * 3)
-    return _solve(reference, other.time_s, gap, weight, np.zeros(9), whiten=None)
+    return _solve(reference, other.time_s, gap, weight, np.zeros(9), whiten=None)[0]
 
 
 def offset_of_corners(
@@ -132,6 +135,18 @@ def offset_of_corners(
 ) -> TimeOffset:
     """Between a course of poses (rig_from_body) and tag corners that a camera with its own stamps saw: `frames` are
     (stamp in s, corners with their places on the body). The camera's place may be off by a few mm and mrad."""
+    return _corner_fit(reference, model, camera_from_rig, frames, RIG_TURN, RIG_SHIFT_M)[0]
+
+
+def _corner_fit(
+    reference: Path3,
+    model: CameraModel,
+    camera_from_rig: Float[Array, "4 4"],
+    frames: Sequence[tuple[float, TargetView]],
+    turn: float,
+    shift_m: float,
+) -> tuple[TimeOffset, Float[Array, "4 4"]]:
+    """Offset and the camera's place, which is known to `turn` and `shift_m` (standard deviations)."""
     frames = [f for f in frames if len(f[1]) >= 4]
     if len(frames) < LEAST_FRAMES:
         raise BadInput(f"the camera sees the object's tags in {len(frames)} frames; wanted at least {LEAST_FRAMES}")
@@ -147,8 +162,30 @@ def offset_of_corners(
         seen = model.project(in_rig @ placed[:3, :3].T + placed[:3, 3])
         return np.where(np.isfinite(seen), seen - pixels, 1e3)
 
-    weight = 1.0 / np.array([RIG_TURN] * 3 + [RIG_SHIFT_M] * 3)
-    return _solve(reference, stamps, gap, weight, np.zeros(6), whiten=white)
+    weight = 1.0 / np.array([turn] * 3 + [shift_m] * 3)
+    found, numbers = _solve(reference, stamps, gap, weight, np.zeros(6), whiten=white)
+    return found, exp_poses(numbers[None])[0] @ camera_from_rig
+
+
+def place_by_motion(
+    reference: Path3, model: CameraModel, frames: Sequence[tuple[float, TargetView]]
+) -> Float[Array, "4 4"] | None:
+    """camera_from_rig of a camera that sees the body's tags at its own times: what most of its frames agree on, then
+    all of them with the place wide open and the offset of its stamps solved along. None where they do not agree."""
+    frames = [f for f in frames if len(f[1]) >= 4]
+    stamps = np.array([t for t, _ in frames])
+    smooth = reference.smooth_at(stamps) if len(frames) else np.zeros(0, dtype=bool)
+    looks = []
+    for (stamp, view), fine in zip(frames, smooth):
+        if fine:
+            position, rotation = reference.at(np.array([stamp]))
+            back = np.eye(4)
+            back[:3, :3], back[:3, 3] = rotation[0].T, -rotation[0].T @ position[0]
+            looks.append([pose @ back for pose, _ in poses_of_points(model, view.points_m, view.pixels)])
+    agreed = most_agreed([look for look in looks if look], 5.0, 0.05)
+    if agreed is None or agreed[1] < LEAST_FRAMES:
+        return None
+    return _corner_fit(reference, model, agreed[0], frames, OPEN_TURN, OPEN_SHIFT_M)[1]
 
 
 def _solve(
@@ -158,7 +195,7 @@ def _solve(
     prior: Float[Array, " k"],
     start: Float[Array, " k"],
     whiten: Float[Array, "n 2 2"] | None,
-) -> TimeOffset:
+) -> tuple[TimeOffset, Float[Array, " k"]]:
     """Coarse search for the offset, then Gauss-Newton over offset and displacement with robust weights."""
     course = np.linalg.norm(np.diff(reference.position_m, axis=0), axis=1) / np.diff(reference.time_s)
     if not len(course) or np.quantile(course, 0.9) < LEAST_SPEED_M_S:
@@ -183,7 +220,7 @@ def _solve(
     for _ in range(3):
         numbers = _fit(residual, numbers, prior, _used(reference, stamps, numbers[0]), 6, False)
     used = _used(reference, stamps, numbers[0])
-    return _finished(residual, gap, numbers, prior, used, stamps)
+    return _finished(residual, gap, numbers, prior, used, stamps), numbers[1:]
 
 
 def _used(reference: Path3, stamps: Float[Array, " n"], offset_s: float) -> Bool[Array, " n"]:

@@ -1,0 +1,215 @@
+"""What `toss-calibrate intrinsics | cameras | hand-eye` do: read the session, solve, judge, draw, write."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray as Array
+
+from calibration import store
+from calibration.drift import bumps
+from calibration.extrinsics import PlacedCameras, calibrate_cameras
+from calibration.hand_eye import calibrate_hand_eye
+from calibration.intrinsics import Lens, calibrate_intrinsics
+from calibration.pictures import residual_picture
+from calibration.report import Finding, Report
+from calibration.tag_faults import explain_absence
+from calibration.views import COLOR, TOGETHER_NS, VIEWS_FILE, BoardViews, grey_images, read_board_views, table_target
+from recordings.errors import BadInput
+from recordings.geometry import DistortionModel, Transform
+from recordings.progress import Progress
+from recordings.robot import ArmPath, panda
+from recordings.session import Session, Toss
+
+DEPTH_SIZE_OFF, DEPTH_SIZE_WRONG = 0.02, 0.05
+TOOL = "panda_hand_tcp"
+LENSES: tuple[DistortionModel, ...] = ("none", "brown-conrady", "rational")
+
+
+@dataclass(frozen=True)
+class Done:
+    """What a command did. `refused`: calibration.json stayed as it was."""
+
+    document: Mapping[str, Any]
+    text: str
+    refused: bool
+
+
+def done(reports: Sequence[Report], written: Path | None, pictures: Sequence[Path], asked: bool) -> Done:
+    """`asked`: somebody wanted it written (no --dry-run)."""
+    refused = any(r.verdict == "refused" for r in reports)
+    if written is not None:
+        last = f"written: {written}"
+    else:
+        last = "refused: calibration.json stays as it was" if refused and asked else "nothing was written"
+    document = {
+        "calibrations": [{"kind": r.kind, **r.to_json()} for r in reports],
+        "verdict": "refused" if refused else "doubtful" if any(r.verdict != "good" for r in reports) else "good",
+        "written": None if written is None else str(written),
+        "pictures": [str(p) for p in pictures],
+    }
+    lines = [r.text() for r in reports] + [f"picture: {p}" for p in pictures] + [last]
+    return Done(document, "\n".join(lines), refused)
+
+
+def intrinsics(path: Path, args: argparse.Namespace, progress: Progress) -> Done:
+    with Session.open(path) as session:
+        views = _board_views(session, progress)
+        wanted = args.camera or sorted(views.board)
+        unknown = sorted(set(wanted) - set(views.board))
+        if unknown:
+            raise BadInput(f"no views of {', '.join(unknown)}; {VIEWS_FILE} has {', '.join(sorted(views.board))}")
+        lenses: dict[str, Lens] = {}
+        for name in wanted:
+            given = session.calibration.cameras.get(name)
+            lenses[name] = calibrate_intrinsics(name, views.sizes[name], views.board[name], args.lens or LENSES, given)
+        reports = [replace(lens.report, kind=f"intrinsics of {name}") for name, lens in lenses.items()]
+        picture = _picture(session, "intrinsics", views, lenses)
+        if args.dry_run or any(r.verdict == "refused" for r in reports):
+            return done(reports, None, [picture], not args.dry_run)
+        calibration = store.updated(session.calibration, cameras={n: lens.model for n, lens in lenses.items()})
+        known = dict(calibration.residuals.get("intrinsics", {}))
+        entries = {**known, **{n: lens.report.to_json() for n, lens in lenses.items()}}
+        written = store.write_entry(session, calibration, "intrinsics", entries)
+        return done(reports, written, [picture], True)
+
+
+def _picture(session: Session, kind: str, views: BoardViews, solved: Mapping[str, Lens]) -> Path:
+    return residual_picture(
+        store.work_folder(session) / f"{kind}.png",
+        f"{session.name}: {kind}",
+        {n: views.sizes[n] for n in solved},
+        {n: lens.pixels for n, lens in solved.items()},
+        {n: lens.residual_px for n, lens in solved.items()},
+    )
+
+
+def _board_views(session: Session, progress: Progress) -> BoardViews:
+    """Raises BadInput where nobody sees the board, saying why as far as the pictures tell."""
+    views = read_board_views(session, store.work_folder(session), progress)
+    if views.seen_at_all:
+        return views
+    with Toss(session.path / VIEWS_FILE) as toss:
+        images = [grey_images(toss, camera)[1] for camera in toss.cameras()]
+        why = explain_absence([image for stack in images for image in stack], session.calibration.tag_family)
+    raise BadInput(f"{session.path / VIEWS_FILE}: the board is in none of the views: {why}")
+
+
+def cameras(path: Path, args: argparse.Namespace, progress: Progress) -> Done:
+    if args.source == "object":
+        from calibration.commands_toss import cameras_from_object
+
+        return cameras_from_object(path, args, progress)
+    with Session.open(path) as session:
+        views = _board_views(session, progress)
+        models = {n: session.calibration.cameras[n] for n in views.board if n in session.calibration.cameras}
+        if len(models) < 2:
+            raise BadInput(f"{path}: {len(models)} cameras with known lenses in the views; wanted two or more")
+        reference = COLOR if COLOR in models else sorted(models)[0]
+        still = views.table if table_target(session.calibration) else None
+        placed = calibrate_cameras(models, views.board, reference, still, args.lenses)
+        findings = [*_together(views), *bumps(views.table)]
+        if reference == COLOR:
+            findings += _size_by_depth(session, views, placed)
+        report = replace(placed.report, findings=(*placed.report.findings, *findings))
+        picture = residual_picture(
+            store.work_folder(session) / "cameras.png",
+            f"{session.name}: cameras",
+            {n: views.sizes[n] for n in models},
+            placed.pixels,
+            placed.residual_px,
+        )
+        if args.dry_run or report.verdict == "refused":
+            return done([report], None, [picture], not args.dry_run)
+        calibration = store.updated(
+            session.calibration,
+            cameras=placed.models if args.lenses else None,
+            transforms=placed.transforms,
+            replaces=[t.source for t in placed.transforms],
+        )
+        return done([report], store.write(session, calibration, "cameras", report), [picture], True)
+
+
+def _together(views: BoardViews) -> list[Finding]:
+    if views.spread_ns <= TOGETHER_NS:
+        return []
+    text = f"the cameras' stamps of one view lie up to {views.spread_ns / 1e6:.0f} ms apart: they are not synchronised"
+    return [Finding("warning", f"{text}; the result is right only if the board stood still in every view")]
+
+
+def _size_by_depth(session: Session, views: BoardViews, placed: PlacedCameras) -> list[Finding]:
+    """The board's distance by its stated size against the D455's depth: a wrong size shows as their ratio."""
+    model = placed.models[COLOR]
+    with Toss(session.path / VIEWS_FILE) as toss:
+        depths = toss.depth()
+        ratios = []
+        for view, pose in placed.reference_from_body.items():
+            look = views.board[COLOR][view]
+            if not len(look) or not len(depths):
+                continue
+            k = depths.nearest(int(views.times_ns[view]))
+            image = depths[k]
+            if image.raw.shape != (model.height, model.width):
+                return []
+            u, v = np.rint(look.pixels).astype(int).T
+            inside = (u >= 0) & (v >= 0) & (u < model.width) & (v < model.height)
+            measured = image.raw[v[inside], u[inside]] * image.unit_m
+            predicted = (look.points_m @ pose[:3, :3].T + pose[:3, 3])[inside, 2]
+            ratios += (measured / predicted)[measured > 0].tolist()
+    if len(ratios) < 20:
+        return []
+    ratio = float(np.median(ratios))
+    if abs(ratio - 1) < DEPTH_SIZE_OFF:
+        return []
+    text = f"by depth the board is {ratio:.3f} of its stated size"
+    solved = placed.report.to_json().get("board_scale")
+    if abs(ratio - 1) < DEPTH_SIZE_WRONG or solved is not None:
+        return [Finding("warning", f"{text}: measure its tags (depth may be off by a percent)")]
+    return [Finding("refused", f"wrong tag size: {text}; correct size_m in session.json")]
+
+
+def hand_eye(path: Path, args: argparse.Namespace, progress: Progress) -> Done:
+    with Session.open(path) as session:
+        views = _board_views(session, progress)
+        if args.camera not in views.board:
+            raise BadInput(f"no views of {args.camera}; {VIEWS_FILE} has {', '.join(sorted(views.board))}")
+        base_from_tool, kept = _robot_poses(session, views)
+        looks = [views.board[args.camera][k] for k in kept]
+        model = session.calibration.camera(args.camera)
+        solved = calibrate_hand_eye(model, looks, base_from_tool, args.mounting)
+        picture = residual_picture(
+            store.work_folder(session) / "hand_eye.png",
+            f"{session.name}: {solved.report.kind}",
+            {args.camera: views.sizes[args.camera]},
+            {args.camera: solved.pixels},
+            {args.camera: solved.residual_px},
+        )
+        if args.dry_run or solved.report.verdict == "refused":
+            return done([solved.report], None, [picture], not args.dry_run)
+        mount = "base" if args.mounting == "eye-to-hand" else "tool"
+        place = Transform.from_matrix(args.camera, mount, solved.camera_from_mount)
+        calibration = store.updated(session.calibration, transforms=[place], replaces=[mount])
+        more = {"mounting": args.mounting, "held_from_board": solved.held_from_board.tolist()}
+        written = store.write(session, calibration, "hand_eye", solved.report, **more)
+        return done([solved.report], written, [picture], True)
+
+
+def _robot_poses(session: Session, views: BoardViews) -> tuple[Float[Array, "n 4 4"], list[int]]:
+    """base_from_tool at every view whose time the joint states cover."""
+    with Toss(session.path / VIEWS_FILE) as toss:
+        states = toss.arm_states()
+    if states is None:
+        raise BadInput(
+            f"{session.path / VIEWS_FILE} has no joint states; record views with the arm: "
+            "`toss-record --calibration hand-eye`"
+        )
+    course = ArmPath(panda(), states)
+    kept = [k for k, when in enumerate(views.times_ns.tolist()) if course.covers(when)]
+    poses = [course.links(int(views.times_ns[k]))[TOOL].matrix for k in kept]
+    return np.array(poses).reshape(-1, 4, 4), kept
