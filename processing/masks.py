@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool
 from numpy import ndarray as Array
 
+from processing.backends import make_segmenter, settings_of
 from processing.given_masks import chosen_masks
 from processing.rig import CAMERA, Rig, RobotOfSession, rig_stage
 from processing.segment.background import BackgroundSegmenter
@@ -81,10 +82,12 @@ def object_masks(run: Run, toss: int, scene: Done) -> Done:
         learned = StaticScene.read(scene.folder)
         found_rig = Rig.read(rig.folder)
         drawn = _robot_frames(run, toss, found_rig)
-        segmenter = BackgroundSegmenter(learned, run.session.calibration.camera(CAMERA), run.config.masks, drawn)
+        background = BackgroundSegmenter(learned, run.session.calibration.camera(CAMERA), run.config.masks, drawn)
+        segmenter = make_segmenter(run.config.backends, background, run.device)
+        robot = None if segmenter is background else drawn
         example = None if shown is None else _example(run, shown)
         progress = run.progress(f"toss {toss}: masks")
-        found = sorted(segmenter.masks(frames, given, example, None, progress), key=lambda m: m.position)
+        found = sorted(segmenter.masks(frames, given, example, robot, progress), key=lambda m: m.position)
         write_masks(folder, toss, [m.mask for m in found], np.array([m.confidence for m in found]))
         empty = sum(not m.mask.any() for m in found)
         return {
@@ -92,10 +95,12 @@ def object_masks(run: Run, toss: int, scene: Done) -> Done:
             "empty": empty,
             "given": len(given),
             "without_depth": len(frames.without_depth),
+            **background.counts,
             "robot": rig.counts["robot"] if drawn is None else "drawn",
         }
 
-    config = {"given_masks": choice, "background": asdict(run.config.masks)}
+    named = settings_of(run.config.backends.segmenter, run.config.backends)
+    config = {"given_masks": choice, "background": asdict(run.config.masks), **named}
     return run.store.run("segment", 2, config, inputs, compute)
 
 

@@ -44,6 +44,16 @@ class BackgroundSettings:
     """A smaller piece behind a finger is not looked for."""
     piece_reach_px: int = 8
     """How far outside of the object's hull such a piece may lie."""
+    darkest: float = 0.12
+    """A frame this much darker than the scene, or brighter by the inverse, is followed by depth alone."""
+    most_clipped: float = 0.5
+    """So is a frame in which a larger share of the scene is overexposed."""
+    least_gain: float = 0.02
+    """A smaller change of brightness is not evened out."""
+    table_share: float = 0.8
+    """A given mask of which so much lies in the table's plane shows the table."""
+    other_share: float = 0.3
+    """Another thing that moves and is larger than this share of the object is counted."""
     part_of_scene: float = 0.9
     """An object less of which stands out from the scene than this was partly learned as scene."""
     unknown: float = 0.02
@@ -71,6 +81,7 @@ class Found:
     confidence: float
     others_px: int = 0
     others_near: bool = False
+    largest_other_px: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,7 +155,14 @@ def follow(
         mask = mask & ~block
     ratio = min(mask.sum(), area) / max(mask.sum(), area, 1)
     others_near = others_px > s.least_px or int((moved & near & ~mask).sum()) > 3 * s.least_px
-    return Found(mask, float(np.clip(sure * min(1.0, ratio / 0.7), 0, 1)), others_px, others_near)
+    largest = _largest_other(moved & ~(cv2.dilate(mask.astype(np.uint8), kernel(9)) > 0), s)
+    return Found(mask, float(np.clip(sure * min(1.0, ratio / 0.7), 0, 1)), others_px, others_near, largest)
+
+
+def _largest_other(moved: Bool[Array, "h w"], s: BackgroundSettings) -> int:
+    """Size of the largest thing, away from the object, that is not scene."""
+    _, _, stats, _ = cv2.connectedComponentsWithStats(moved.astype(np.uint8), connectivity=4)
+    return int(stats[1:, cv2.CC_STAT_AREA].max(initial=0))
 
 
 def _shifted(mask: Bool[Array, "h w"], by_px: Float[Array, "2"]) -> Bool[Array, "h w"]:

@@ -293,6 +293,25 @@ def with_object_removed(
     return replace(scene, depth_m=depth, known=scene.known & ~stands, table_depth_m=table)
 
 
+def exposure_gain(frame: RgbdFrame, scene: StaticScene) -> tuple[float, float]:
+    """How bright the frame is against the scene (median over known pixels that are not clipped), and the share of the
+    scene's mid-bright pixels that are clipped in the frame."""
+    color, base = frame.color_rgb[::4, ::4].astype(np.float32), scene.color_rgb[::4, ::4]
+    level = scene.known[::4, ::4] & (base.max(-1) > 20) & (base.max(-1) < 230)
+    if not level.any():
+        return 1.0, 0.0
+    bright = color[level].max(-1)
+    clipped = bright >= 250
+    usable = ~clipped if not clipped.all() else clipped
+    ratio = color[level].sum(-1)[usable] / np.maximum(base[level].sum(-1)[usable], 1.0)
+    return float(np.median(ratio)), float(clipped.mean())
+
+
+def colorless(scene: StaticScene) -> StaticScene:
+    """The scene for a frame whose colours say nothing: only its depth is known."""
+    return replace(scene, color_sigma=np.full_like(scene.color_sigma, 1e4))
+
+
 def surroundings(mask: Bool[Array, "h w"]) -> Bool[Array, "h w"]:
     """The mask and what lies within its own size around it."""
     import cv2
