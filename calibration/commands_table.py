@@ -193,10 +193,11 @@ def _gravity(
         if not mono_cameras(session, session.toss(number).cameras()):
             continue
         try:
-            course = solve_toss(session, number, args, progress).course
+            course = solve_toss(session, number, args, progress).centered()
         except BadInput:
             continue
-        flight = find_flight(course)
+        release_ns = session.toss(number).window().release_time_ns
+        flight = find_flight(course, None if release_ns is None else release_ns / 1e9)
         if flight is not None:
             in_rig = gravity_from_flight(course, flight)
             found.append(replace(in_rig, down=world_from_rig.vectors(in_rig.down[None])[0]))

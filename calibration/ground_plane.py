@@ -41,6 +41,8 @@ RANSAC_ROUNDS = 200
 GRAVITY_DEG = 1.0
 LEAST_FLIGHT = 7
 FLIGHT_RMS_M = 0.0012
+CENTER_SIGMA_M = 0.01
+"""Of the centre of mass about the middle of the tags."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -249,10 +251,10 @@ class Gravity:
 
 def gravity_from_flight(course: Path3, flight: slice) -> Gravity:
     """From positions in free flight, p + R c = a + v t + g t^2 / 2: with rotations the centre of mass c of the body is
-    found too (the tracked point need not be it). Raises BadInput for too short a flight."""
+    found too, within a centimetre or so of the tracked point. Raises BadInput for too short a flight."""
     found, left = _ballistic(course, flight)
     acceleration, size = found[6:9], float(np.linalg.norm(found[6:9]))
-    spare = max(1, left.size - len(found))
+    spare = max(1, left.size - 9)
     A = _ballistic_matrix(course, flight)
     covariance = float((left**2).sum()) / spare * np.linalg.pinv(A.T @ A)[6:9, 6:9]
     across = np.eye(3) - np.outer(acceleration, acceleration) / size**2
@@ -260,10 +262,12 @@ def gravity_from_flight(course: Path3, flight: slice) -> Gravity:
     return Gravity(acceleration / size, float(np.degrees(std)), size, len(left))
 
 
-def find_flight(course: Path3) -> slice | None:
-    """The longest stretch that a parabola explains to a millimetre with about the right acceleration; None without."""
+def find_flight(course: Path3, release_s: float | None = None) -> slice | None:
+    """The longest stretch (after the release, where that is known) that a parabola explains to a millimetre with about
+    the right acceleration; None without one."""
     count, best = len(course.time_s), None
-    for start in range(count - LEAST_FLIGHT):
+    first = 0 if release_s is None else int(np.searchsorted(course.time_s, release_s))
+    for start in range(first, count - LEAST_FLIGHT):
         for stop in range(count, start + LEAST_FLIGHT, -1):
             if best is not None and stop - start <= best.stop - best.start:
                 break
@@ -280,16 +284,19 @@ def _ballistic(course: Path3, flight: slice) -> tuple[Array, Float[Array, "n 3"]
     if count < LEAST_FLIGHT:
         raise BadInput(f"{count} frames of free flight; wanted {LEAST_FLIGHT} or more")
     A, places = _ballistic_matrix(course, flight), course.position_m[flight].ravel()
+    places = np.concatenate([places, np.zeros(len(A) - len(places))])
     found = np.linalg.lstsq(A, places, rcond=None)[0]
-    return found, (places - A @ found).reshape(-1, 3)
+    return found, (places - A @ found)[: 3 * count].reshape(-1, 3)
 
 
 def _ballistic_matrix(course: Path3, flight: slice) -> Float[Array, "m k"]:
-    """Columns a, v, g, and c where rotations are known."""
+    """Columns a, v, g, and c where rotations are known, with rows that hold c near the tracked point."""
     t = course.time_s[flight] - course.time_s[flight].mean()
     parts = [np.kron(factor[:, None], np.eye(3)) for factor in (np.ones_like(t), t, 0.5 * t * t)]
     if course.rotation is not None:
         parts.append(-course.rotation[flight].reshape(-1, 3))
+        near = np.hstack([np.zeros((3, 9)), FLIGHT_RMS_M / CENTER_SIGMA_M * np.eye(3)])
+        return np.vstack([np.hstack(parts), near])
     return np.hstack(parts)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy import ndarray as Array
@@ -44,6 +44,12 @@ class SolvedToss:
     course: Path3
     size_m: Mapping[int, float]
     findings: tuple[Finding, ...]
+
+    def centered(self) -> Path3:
+        """The course of the middle of the tags, which is nearer to the centre of mass than one tag is."""
+        middle = np.mean([place[:3, 3] for place in self.body.body_from_tag.values()], axis=0)
+        assert self.course.rotation is not None
+        return replace(self.course, position_m=self.course.position_m + self.course.rotation @ middle)
 
 
 def solve_toss(session: Session, number: int, args: argparse.Namespace, progress: Progress) -> SolvedToss:
