@@ -58,6 +58,8 @@ class BeamConfig:
     hold_deg: float = 2.0
     hold_m: float = 0.01
     """... of this standard deviation."""
+    still_share: float = 0.2
+    """Of that standard deviation, where the images say that nothing moved."""
     motion: MotionConfig = field(default_factory=MotionConfig)
     keyframes: KeyframeConfig = field(default_factory=KeyframeConfig)
     ransac: RansacConfig = field(default_factory=RansacConfig)
@@ -223,6 +225,9 @@ def _differ(a: Hypothesis, b: Hypothesis, i: int, config: BeamConfig) -> bool:
 
 def _branches(scene: Scene, h: Hypothesis, i: int, config: BeamConfig) -> tuple[list[Candidate], list[Candidate]]:
     """Candidates of one hypothesis for frame i: those that may live on, best first, and the others."""
+    still = _standing(scene, h, i, config)
+    if still is not None:
+        return [still], []
     starts = _usual_starts(scene, h, i)
     found = merged(_aligned_all(scene, h, i, starts, config) + _held(scene, h, i, starts, config), config)
     if not found or found[0].fit > config.doubt:
@@ -321,6 +326,15 @@ def _held(
     return [c for c in found if c is not None]
 
 
+def _standing(scene: Scene, h: Hypothesis, i: int, config: BeamConfig) -> Candidate | None:
+    """The last pose, where the images say that nothing moved: what looks the same from all sides must not turn."""
+    last = h.tracked[-1]
+    if abs(last - i) != 1 or not scene.store.stands_still(last, i):
+        return None
+    found = _aligned(scene, h, i, h.poses[last], config.fine, config, "standing", h.poses[last], config.still_share)
+    return found if found is not None and found.fit < config.search else None
+
+
 def merged(candidates: list[Candidate], config: BeamConfig) -> list[Candidate]:
     """Sorted by cost, without those that say the same as a better one."""
     kept: list[Candidate] = []
@@ -332,7 +346,7 @@ def merged(candidates: list[Candidate], config: BeamConfig) -> list[Candidate]:
 
 def _aligned(
     scene: Scene, h: Hypothesis, i: int, pose: Float[Array, "4 4"], schedule: Schedule, config: BeamConfig, source: str,
-    held: Float[Array, "4 4"] | None = None,
+    held: Float[Array, "4 4"] | None = None, share: float = 1.0,
 ) -> Candidate | None:  # fmt: skip
     """One candidate aligned to the nearest views of the model, held to the pose that the motion foretells where it is
     given; None where nothing faces it."""
@@ -343,7 +357,7 @@ def _aligned(
         return None
     store = scene.store
     distance = float(np.linalg.norm(store.center_m[i]))
-    pull, wanted = (np.zeros(6), np.eye(4)) if held is None else (_hold(config), held)
+    pull, wanted = (np.zeros(6), np.eye(4)) if held is None else (_hold(config) / share**2, held)
     aligned, _, fit, on, _ = k.align_view(
         np.ascontiguousarray(pose), i, refs, np.ascontiguousarray(h.poses[refs]), store.maps, store.samples,
         store.table, store.optics.focal, store.optics.center, rows(schedule, distance), pull, wanted,
@@ -369,4 +383,6 @@ def _price(scene: Scene, h: Hypothesis, i: int, pose: Float[Array, "4 4"], confi
     a, b = tracked[-2], tracked[-1]
     three = (h.poses[a], h.poses[b], pose)
     steps = (times[b] - times[a], times[i] - times[b])
-    return change_cost(three, steps, scene.center_m, scene.gravity_camera_m_s2, config.motion)
+    recent = list(tracked[-6:])
+    spin = steady_spin(h.poses[recent], times[recent])
+    return change_cost(three, steps, scene.center_m, scene.gravity_camera_m_s2, config.motion, spin)

@@ -10,6 +10,7 @@ from numpy import ndarray as Array
 
 from processing.track.beam import Scene
 from processing.track.motion import between
+from recordings.geometry import rotation_log
 from recordings.tracks import Status
 
 
@@ -24,6 +25,10 @@ class FlagConfig:
     gap_sigma_rad: float = 0.15
     gap_sigma_m: float = 0.02
     """Standard deviation of an interpolated pose in the middle of the longest gap."""
+    rival_cost: float = 0.0015
+    """Another story of the same frames that fits worse by this much counts half as evidence of doubt."""
+    unsure_deg: float = 15.0
+    """A pose whose rotation may be off by more than this (standard deviation) is a guess: marked as interpolated."""
 
 
 def per_view(pairs: Int[Array, "m 2"], figures: Float[Array, "m 3"], n: int) -> tuple[Array, Array]:
@@ -33,6 +38,20 @@ def per_view(pairs: Int[Array, "m 2"], figures: Float[Array, "m 3"], n: int) -> 
         mine = (pairs == i).any(1)
         cost[i], on[i] = np.median(figures[mine, 0]), np.median(figures[mine, 1])
     return cost, on
+
+
+def doubt(
+    poses: Float[Array, "n 4 4"], rival: Float[Array, "n 4 4"], worse_by: float, config: FlagConfig
+) -> Float[Array, "n 6 6"]:
+    """Covariance (twist of the object frame, translation first) that another story of the same frames adds: the outer
+    product of their difference, less the worse the other one fits. Zero where either has no pose."""
+    out = np.zeros((len(poses), 6, 6))
+    share = 1.0 / (1.0 + (worse_by / config.rival_cost) ** 2)
+    for i in np.flatnonzero(np.isfinite(poses[:, 0, 0]) & np.isfinite(rival[:, 0, 0])):
+        between_them = np.linalg.inv(poses[i]) @ rival[i]
+        gap = np.concatenate([between_them[:3, 3], rotation_log(between_them[:3, :3])])
+        out[i] = share * np.outer(gap, gap)
+    return out
 
 
 def flagged(
@@ -45,6 +64,8 @@ def flagged(
     tracked = np.flatnonzero(~lost)
     for i in tracked:
         sigma[i] = camera_covariance(poses[i], covariance[i])
+        if np.linalg.eigvalsh(sigma[i, :3, :3])[-1] > np.radians(config.unsure_deg) ** 2:
+            status[i] = "interpolated"
     for i in np.flatnonzero(lost):
         out[i], status[i] = np.nan, "lost"
         before, after = tracked[tracked < i], tracked[tracked > i]

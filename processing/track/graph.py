@@ -45,11 +45,19 @@ class GraphConfig:
     """Standard deviation of the change of spin between frames in flight (not an impact)."""
     velocity_change_m_s: float = 0.06
     """... and of the velocity beyond gravity's share."""
+    jerk_rad_s: float | None = 0.25
+    """Standard deviation of the change of that change: spin changes slowly in flight and while an arm swings."""
     still_rad: float = 0.003
     still_m: float = 0.0002
     """What a body that stands still may move between frames (standard deviation)."""
     shared_noise: float = 8.0
     """A view's pairs share its noise: together they count as one, so many times over."""
+
+
+def steady_motion() -> GraphConfig:
+    """Settings under which steady motion outweighs what the images say."""
+    rough = ((1, 6, 0.006, 0.4, 0.008, 0.3), (1, 6, 0.006, 0.4, 0.008, 0.5))
+    return GraphConfig(shared_noise=200.0, jerk_rad_s=0.1, schedule=(*rough, *GraphConfig().schedule[1:]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,6 +174,8 @@ def _add_motion(
     (Cauchy). The residuals are changes of spin (rad/s) and of velocity (m/s), camera axes."""
     index = np.flatnonzero(use)
     _add_still(H, g, poses, index, place, motion, config)
+    if config.jerk_rad_s is not None:
+        _add_smooth(H, g, poses, index, place, motion, config.jerk_rad_s)
     for a, b, c in zip(index, index[1:], index[2:]):
         if motion.toss[a] != motion.toss[c] or motion.still[b] or motion.still[c]:
             continue
@@ -181,6 +191,29 @@ def _add_motion(
             for y, jy in zip((a, b, c), jacobians):
                 if place[y] >= 0:
                     H[place[x], place[y]] += jx.T @ (w[:, None] * jy)
+
+
+def _add_smooth(
+    H: Float[Array, "f f 6 6"], g: Float[Array, "f 6"], poses: Float[Array, "n 4 4"], index: Int[Array, " m"],
+    place: Int[Array, " n"], motion: Motion, sigma_rad_s: float,
+) -> None:  # fmt: skip
+    """Adds the pull towards a steady change of spin over each four views in a row (rad/s, camera axes; Cauchy)."""
+    for four in zip(index, index[1:], index[2:], index[3:]):
+        if len({int(motion.toss[i]) for i in four}) > 1 or motion.still[list(four[1:])].any():
+            continue
+        steps = np.diff(motion.times_s[list(four)])
+        spins = [turn_between(poses[b], poses[a]) / s for a, b, s in zip(four, four[1:], steps)]
+        residual = spins[2] - 2 * spins[1] + spins[0]
+        w = 1.0 / (sigma_rad_s**2 + residual @ residual / 4.0)
+        shares = (-1 / steps[0], 1 / steps[0] + 2 / steps[1], -2 / steps[1] - 1 / steps[2], 1 / steps[2])
+        jacobians = [-share * poses[i][:3, :3] for i, share in zip(four, shares)]
+        for x, jx in zip(four, jacobians):
+            if place[x] < 0:
+                continue
+            g[place[x], 3:] += w * jx.T @ residual
+            for y, jy in zip(four, jacobians):
+                if place[y] >= 0:
+                    H[place[x], place[y], 3:, 3:] += w * jx.T @ jy
 
 
 def _add_still(

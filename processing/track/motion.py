@@ -87,13 +87,15 @@ def change_cost(
     center_m: Float[Array, "3"],
     gravity_camera_m_s2: Float[Array, "3"],
     config: MotionConfig,
+    spin_rad_s: Float[Array, "3"] | None = None,
 ) -> float:
     """Price of the change of motion over three poses, at most impact_cost + shift_cost (and more for very fast spins).
 
-    Zero for a body in free flight with constant spin, and (but for gravity's share) for one at rest.
+    Zero for a body in free flight with constant spin, and (but for gravity's share) for one at rest. `spin_rad_s`
+    (camera axes) is the spin before, where it is known better than from the first two poses.
     """
     first, second, third = poses
-    spin0 = turn_between(second, first) / steps_s[0]
+    spin0 = turn_between(second, first) / steps_s[0] if spin_rad_s is None else spin_rad_s
     spin1 = turn_between(third, second) / steps_s[1]
     x0, x1, x2 = (p[:3, :3] @ center_m + p[:3, 3] for p in poses)
     free = (x2 - x1) / steps_s[1] - (x1 - x0) / steps_s[0]

@@ -44,6 +44,12 @@ class RegisterConfig:
     """A registration by features that fits worse also tries the grid."""
     worst: float = 0.22
     """A toss that fits worse is left out."""
+    sure_votes: float = 80.0
+    """Feature matches that must agree on a registration, and on no other half as many, or the grid is tried too."""
+    apart_deg: float = 15.0
+    """Registrations nearer to each other are the same."""
+    ambiguous: float = 0.02
+    """Another registration that fits worse by less than this may be the right one."""
     pairs: int = 24
     co_visible_deg: float = 45.0
     coarse: Schedule = ((1, 6, 0.012, 0.5, 0.012, 0.12), (1, 4, 0.006, 0.4, 0.008, 0.2))
@@ -56,12 +62,19 @@ class RegisterConfig:
 @dataclass(frozen=True, eq=False)
 class Registered:
     """All tracks in the object frame of the first; `fit` per toss (0 good .. 1; 0 for the first), `joined` says which
-    could be registered: the others keep their own frame. `first_from_own` 4x4 per toss."""
+    could be registered: the others keep their own frame. `first_from_own` 4x4 per toss.
+
+    `gap` per toss: how much worse the best different registration fits (infinite: there is none); where that is less
+    than the settings' `ambiguous`, the toss is `ambiguous`: the object looks the same from several sides, and nothing
+    in the images tells which one is right.
+    """
 
     tracks: tuple[ObjectTrack, ...]
     joined: tuple[bool, ...]
     fit: Float[Array, " t"]
     first_from_own: Float[Array, "t 4 4"]
+    gap: Float[Array, " t"]
+    ambiguous: tuple[bool, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,6 +86,14 @@ class _Pool:
     toss: Int[Array, " n"]
     frame: Int[Array, " n"]
     center_m: Float[Array, "3"]
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """One registration of a toss (4x4) and what it costs: mean over pairs, 0 perfect .. 1, infinite: no pair."""
+
+    first_from_own: Float[Array, "4 4"]
+    cost: float
 
 
 def register_tosses(
@@ -103,24 +124,49 @@ def register_tosses(
     if together:
         fit[:] = 0.0
     features: dict[int, Features] = {}
-    waiting = [] if together else [t for t in range(len(tosses)) if t != root]
+    waiting = [t for t in range(len(tosses)) if t != root]
+    found: dict[int, list[_Fit]] = {}
     rounds = 0
     while waiting and rounds < 2:  # a toss that does not fit now may fit when more of the object is known
         for t in list(waiting):
             joined = np.flatnonzero(np.isfinite(fit))
-            transform, cost = _registered(pool, t, joined, first_from_own, features, matcher, config)
-            if cost < config.worst * (0.75 if rounds == 0 else 1.0):
-                first_from_own[t], fit[t] = transform, cost
+            found[t] = _registered(pool, t, joined, first_from_own, features, matcher, config)
+            if found[t] and found[t][0].cost < config.worst * (0.75 if rounds == 0 else 1.0):
+                first_from_own[t], fit[t] = found[t][0].first_from_own, found[t][0].cost
                 waiting.remove(t)
             progress.step(len(tosses) - len(waiting), len(tosses), f"toss {tosses[t].track.toss}")
         rounds += 1
+    gap = _settled(pool, found, fit, first_from_own, config)[: len(tosses)]
     fixed = pool.toss == root
     if model is None:
         fixed[1:] = False
     poses = _refined(pool, np.isfinite(fit), first_from_own, fixed, config)
     fit, first_from_own = fit[: len(tosses)], first_from_own[: len(tosses)]
     tracks = [_moved_track(toss, pool, t, poses, bool(np.isfinite(fit[t]))) for t, toss in enumerate(tosses)]
-    return Registered(tuple(tracks), tuple(bool(f) for f in np.isfinite(fit)), fit, first_from_own)
+    joined_all = np.isfinite(fit)
+    unsure = joined_all & (gap < config.ambiguous)
+    return Registered(tuple(tracks), tuple(map(bool, joined_all)), fit, first_from_own, gap, tuple(map(bool, unsure)))
+
+
+def _settled(
+    pool: _Pool, found: dict[int, list[_Fit]], fit: Float[Array, " t"], first_from_own: Float[Array, "t 4 4"],
+    config: RegisterConfig,
+) -> Float[Array, " t"]:  # fmt: skip
+    """Tosses that several registrations fitted are judged once more, now against all others; the best is taken (fit
+    and first_from_own are changed). Returns how far behind the best different one is."""
+    gap = np.full(len(fit), np.inf)
+    for t, several in found.items():
+        rivals = [f for f in several if f.cost < several[0].cost + 3 * config.ambiguous]
+        if not np.isfinite(fit[t]) or len(rivals) < 2:
+            continue
+        others = np.flatnonzero(np.isfinite(fit) & (np.arange(len(fit)) != t))
+        mine, theirs, model = _sides(pool, t, others, first_from_own)
+        again = [_aligned(pool, mine, theirs, model, f.first_from_own, config.fine, 2 * config.pairs, config)
+                 for f in rivals]  # fmt: skip
+        ordered = _distinct(again, config)
+        first_from_own[t], fit[t] = ordered[0].first_from_own, ordered[0].cost
+        gap[t] = ordered[1].cost - ordered[0].cost if len(ordered) > 1 else np.inf
+    return gap
 
 
 def _pooled(tosses: Sequence[TossTrack], model: ObjectShape | None, config: RegisterConfig) -> _Pool:
@@ -158,33 +204,51 @@ def _spread(toss: TossTrack, count: int) -> Int[Array, " m"]:
     return np.sort(usable[chosen])
 
 
-def _registered(
-    pool: _Pool, t: int, joined: Int[Array, " j"], first_from_own: Float[Array, "t 4 4"],
-    features: dict[int, Features], matcher: FeatureMatcher, config: RegisterConfig,
-) -> tuple[Float[Array, "4 4"], float]:  # fmt: skip
-    """The best first_from_own of toss t against the joined tosses, and what it costs."""
-    mine = np.flatnonzero(pool.toss == t)
-    theirs = np.flatnonzero(np.isin(pool.toss, joined))
-    if len(mine) == 0 or len(theirs) == 0:
-        return np.eye(4), np.inf
+def _sides(
+    pool: _Pool, t: int, joined: Int[Array, " j"], first_from_own: Float[Array, "t 4 4"]
+) -> tuple[Int[Array, " a"], Int[Array, " b"], Float[Array, "n 4 4"]]:
+    """Views of toss t, views of the joined tosses, and the poses of the latter in the common frame."""
     model = pool.poses.copy()
     for j in joined:
         rows_j = pool.toss == j
         model[rows_j] = pool.poses[rows_j] @ np.linalg.inv(first_from_own[j])
-    proposals = _by_features(pool, mine, theirs, model, features, matcher, config)
-    best, cost = _best(pool, mine, theirs, model, proposals, config)
-    if cost > config.doubt:
-        other, other_cost = _best(pool, mine, theirs, model, _by_grid(pool, mine, theirs, model, config), config)
-        if other_cost < cost:
-            best, cost = other, other_cost
-    return best, cost
+    return np.flatnonzero(pool.toss == t), np.flatnonzero(np.isin(pool.toss, joined)), model
+
+
+def _registered(
+    pool: _Pool, t: int, joined: Int[Array, " j"], first_from_own: Float[Array, "t 4 4"],
+    features: dict[int, Features], matcher: FeatureMatcher, config: RegisterConfig,
+) -> list[_Fit]:  # fmt: skip
+    """Different registrations of toss t against the joined tosses, best first."""
+    mine, theirs, model = _sides(pool, t, joined, first_from_own)
+    if len(mine) == 0 or len(theirs) == 0:
+        return []
+    proposals, votes = _by_features(pool, mine, theirs, model, features, matcher, config)
+    found = _best(pool, mine, theirs, model, proposals, config)
+    second = max(votes[1:], default=0.0)
+    sure = bool(votes) and votes[0] >= config.sure_votes and second < 0.5 * votes[0]
+    if not found or found[0].cost > config.doubt or not sure:
+        found += _best(pool, mine, theirs, model, _by_grid(pool, mine, theirs, model, config), config)
+    return _distinct(found, config)
+
+
+def _distinct(found: list[_Fit], config: RegisterConfig) -> list[_Fit]:
+    """Sorted by cost, without those that say the same as a better one."""
+    kept: list[_Fit] = []
+    least = 1 + 2 * np.cos(np.radians(config.apart_deg))
+    for f in sorted(found, key=lambda f: f.cost):
+        turns = [float(np.trace(o.first_from_own[:3, :3].T @ f.first_from_own[:3, :3])) for o in kept]
+        if np.isfinite(f.cost) and all(turn < least for turn in turns):
+            kept.append(f)
+    return kept
 
 
 def _by_features(
     pool: _Pool, mine: Int[Array, " a"], theirs: Int[Array, " b"], model: Float[Array, "n 4 4"],
     features: dict[int, Features], matcher: FeatureMatcher, config: RegisterConfig,
-) -> list[Float[Array, "4 4"]]:  # fmt: skip
-    """Transforms that feature matches between keyframes say, the most supported first, near copies merged."""
+) -> tuple[list[Float[Array, "4 4"]], list[float]]:  # fmt: skip
+    """Transforms that feature matches between keyframes say, the most supported first, near copies merged, and how
+    many matches support each."""
     for i in (*mine, *theirs):
         if int(i) not in features:
             features[int(i)] = matcher.describe(pool.store, int(i))
@@ -197,7 +261,7 @@ def _by_features(
     return _voted(found, config.tried)
 
 
-def _voted(found: list[tuple[float, Float[Array, "4 4"]]], most: int) -> list[Float[Array, "4 4"]]:
+def _voted(found: list[tuple[float, Float[Array, "4 4"]]], most: int) -> tuple[list[Float[Array, "4 4"]], list[float]]:
     """Merges transforms within 15 degrees; the sum of their inliers is the vote."""
     groups: list[tuple[float, Float[Array, "4 4"]]] = []
     for votes, transform in sorted(found, key=lambda f: -f[0]):
@@ -207,7 +271,8 @@ def _voted(found: list[tuple[float, Float[Array, "4 4"]]], most: int) -> list[Fl
                 break
         else:
             groups.append((votes, transform))
-    return [g[1] for g in sorted(groups, key=lambda g: -g[0])][:most]
+    ordered = sorted(groups, key=lambda g: -g[0])[:most]
+    return [g[1] for g in ordered], [g[0] for g in ordered]
 
 
 def _by_grid(
@@ -221,8 +286,8 @@ def _by_grid(
         transform[:3, :3] = turn
         transform[:3, 3] = middle_model - turn @ middle_own
         scored.append((_aligned(pool, mine, theirs, model, transform, config.coarse[:1], 6, config), transform))
-    scored.sort(key=lambda s: s[0][1])
-    return [s[0][0] for s in scored[: config.tried // 2]]
+    scored.sort(key=lambda s: s[0].cost)
+    return [s[0].first_from_own for s in scored[: config.tried // 2]]
 
 
 def _middle(pool: _Pool, views: Int[Array, " a"], poses: Float[Array, "n 4 4"]) -> Float[Array, "3"]:
@@ -240,18 +305,18 @@ def _middle(pool: _Pool, views: Int[Array, " a"], poses: Float[Array, "n 4 4"]) 
 def _best(
     pool: _Pool, mine: Int[Array, " a"], theirs: Int[Array, " b"], model: Float[Array, "n 4 4"],
     proposals: list[Float[Array, "4 4"]], config: RegisterConfig,
-) -> tuple[Float[Array, "4 4"], float]:  # fmt: skip
-    """Each proposal aligned coarsely, the best five finely; the best of them."""
+) -> list[_Fit]:  # fmt: skip
+    """Each proposal aligned coarsely, the best five different ones finely, best first."""
     rough = [_aligned(pool, mine, theirs, model, p, config.coarse, config.pairs // 2, config) for p in proposals]
-    rough.sort(key=lambda r: r[1])
-    fine = [_aligned(pool, mine, theirs, model, r[0], config.fine, config.pairs, config) for r in rough[:5]]
-    return min(fine, key=lambda f: f[1], default=(np.eye(4), np.inf))
+    good = _distinct(rough, config)[:5]
+    fine = [_aligned(pool, mine, theirs, model, r.first_from_own, config.fine, config.pairs, config) for r in good]
+    return sorted(fine, key=lambda f: f.cost)
 
 
 def _aligned(
     pool: _Pool, mine: Int[Array, " a"], theirs: Int[Array, " b"], model: Float[Array, "n 4 4"],
     transform: Float[Array, "4 4"], schedule: Schedule, pairs: int, config: RegisterConfig,
-) -> tuple[Float[Array, "4 4"], float]:  # fmt: skip
+) -> _Fit:  # fmt: skip
     """Gauss-Newton of one transform (model_from_own) over the pairs of views that see the same side; its mean cost."""
     store = pool.store
     poses = model.copy()
@@ -261,7 +326,7 @@ def _aligned(
             poses[mine] = pool.poses[mine] @ np.linalg.inv(transform)
             both = _facing_pairs(poses, mine, theirs, pool.center_m, pairs, config)
             if len(both) == 0:
-                return transform, np.inf
+                return _Fit(transform, np.inf)
             blocks, gradients = np.zeros((len(both), 6, 6)), np.zeros((len(both), 6))
             figures = np.zeros((len(both), 3))
             k.graph_terms(
@@ -274,7 +339,7 @@ def _aligned(
             step = -np.linalg.solve(H + np.diag(1e-5 * np.diag(H) + 1e-9 * np.trace(H) + 1e-9), g)
             size = max(np.linalg.norm(step[:3]) / 0.03, np.linalg.norm(step[3:]) / 0.25, 1.0)
             transform = k.exponential(step / size) @ transform
-    return transform, cost
+    return _Fit(transform, cost)
 
 
 def _facing_pairs(

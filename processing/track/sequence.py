@@ -13,22 +13,23 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray as Array
 
 from processing.track import kernels as k
-from processing.track.beam import LEAST_DELAY_S, BeamConfig, Candidate, Hypothesis, Scene, follow, started
-from processing.track.delay import put_at_color_times
+from processing.track.beam import BeamConfig, Candidate, Hypothesis, Scene, follow, started
 from processing.track.exposure import Exposure
 from processing.track.features import FeatureMatcher, Sift
-from processing.track.flags import FlagConfig, flagged, per_view
-from processing.track.graph import GraphConfig, Motion, refine
+from processing.track.flags import FlagConfig, doubt, flagged, per_view
 from processing.track.keyframes import is_new
 from processing.track.known_shape import ShapeConfig, ShapeViews, located, middle_of, shape_views
-from processing.track.middle import center_of_mass
 from processing.track.motion import gravity_in_camera
+from processing.track.story import Story, StoryConfig, apart_deg, settled
 from processing.track.views import Crop, Optics, ViewConfig, ViewStore, cut
 from recordings.errors import BadInput
 from recordings.geometry import CameraModel, Transform
 from recordings.progress import Progress, Silent
 from recordings.records import RgbdFrame
 from recordings.tracks import ObjectShape, ObjectTrack
+
+UNFIT_COST = 0.15
+"""Of a frame against those that see the same surface: one rigid body fits better, however it looks."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +38,7 @@ class TrackConfig:
 
     view: ViewConfig = field(default_factory=ViewConfig)
     beam: BeamConfig = field(default_factory=BeamConfig)
-    graph: GraphConfig = field(default_factory=GraphConfig)
+    story: StoryConfig = field(default_factory=StoryConfig)
     flags: FlagConfig = field(default_factory=FlagConfig)
     shape: ShapeConfig = field(default_factory=ShapeConfig)
     least_confidence: float = 0.2
@@ -64,6 +65,17 @@ class TossTrack:
     margin: float
     """How much worse the best different story fits (infinite: there is none)."""
     store: ViewStore
+
+    @property
+    def unfit(self) -> int:
+        """Frames that no pose fits: where they are many, the masks do not show one rigid body."""
+        return int(np.sum(~self.fits))
+
+    @property
+    def fits(self) -> Bool[Array, " n"]:
+        """Whether a pose explains what each looked-at frame shows (frames that show nothing count as fitting)."""
+        seen = np.array([self.store.usable(i) for i in range(len(self.cost))], dtype=bool)
+        return ~seen | (self.cost < UNFIT_COST)
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,11 +130,14 @@ def track_toss(
     middle = _middle(store, first, known) if model is None else middle_of(model)
     scene = Scene(store, times_s, gravity_in_camera(world), middle, matcher or Sift())
     if known.poses is None:
-        best, margin, rejected = _followed(scene, first, known, config, progress)
+        stories, margin, rejected = _followed(scene, first, known, config, progress)
     else:
-        best, margin, rejected = _filled_in(scene, known, config, progress)
+        story, margin, rejected = _filled_in(scene, known, config, progress)
+        stories = [story]
+    keep_first = model is None or known.start is not None
+    joint = settled(scene, stories, first, keep_first, config.story)
     frame = object_frame if model is None else model.object_frame
-    return _refined(scene, best, first, known, margin, rejected, config, toss, camera.frame, frame, frames)
+    return _told(scene, joint, first, margin, rejected, config, toss, camera.frame, frame, frames)
 
 
 def _known(
@@ -214,8 +229,9 @@ def _middle(store: ViewStore, view: int, known: _Known) -> Float[Array, "3"]:
 
 def _followed(
     scene: Scene, first: int, known: _Known, config: TrackConfig, progress: Progress
-) -> tuple[Hypothesis, float, dict[int, list[Candidate]]]:
-    """The beam forward, then once more backward with all that forward learned as the model."""
+) -> tuple[list[Hypothesis], float, dict[int, list[Candidate]]]:
+    """Two stories of the same frames: the beam forward, then once more backward with all that forward learned as the
+    model; and a beam backward that knows nothing of the first but where the last frame is."""
     n = len(scene.times_s)
 
     def told(i: int, beam: list[Hypothesis]) -> None:
@@ -228,11 +244,27 @@ def _followed(
     told_all = replace(best, done=(last,), total=0.0)
     stop = first if known.model is None or known.start is not None else first - 1
     narrow = replace(config.beam, width=2)
-    back = follow(scene, np.arange(last - 1, stop, -1), [told_all], narrow).best
-    if any(scene.store.usable(i) for i in range(first)):
-        back = follow(scene, np.arange(first - 1, -1, -1), [replace(back, done=(*back.done, first))], narrow).best
-    done = tuple(range(n))
-    return replace(back, done=done, total=best.total), ahead.margin, ahead.rejected
+    stories = [follow(scene, np.arange(last - 1, stop, -1), [told_all], narrow).best]
+    if known.model is None and last > first + 1:
+        fresh = started(scene.store, n, last, best.poses[last])
+        stories.append(_anchored(follow(scene, np.arange(last - 1, first - 1, -1), [fresh], narrow).best, best, first))
+    out = []
+    for story in stories:
+        if any(scene.store.usable(i) for i in range(first)):
+            done = (*(i for i in story.done if i != first), first)
+            story = follow(scene, np.arange(first - 1, -1, -1), [replace(story, done=done)], narrow).best
+        out.append(replace(story, done=tuple(range(n)), total=best.total))
+    return out, ahead.margin, ahead.rejected
+
+
+def _anchored(story: Hypothesis, other: Hypothesis, first: int) -> Hypothesis:
+    """The story in the object frame in which the first frame's pose is that of the other story."""
+    if not np.isfinite(story.poses[first, 0, 0]):
+        return story
+    own_from_other = np.linalg.inv(story.poses[first]) @ other.poses[first]
+    poses = story.poses @ own_from_other
+    poses[first] = other.poses[first]
+    return replace(story, poses=poses)
 
 
 def _starts(scene: Scene, first: int, known: _Known, config: TrackConfig) -> tuple[list[Hypothesis], BeamConfig]:
@@ -287,35 +319,26 @@ def _filled_in(
     return replace(h, done=tuple(range(n))), np.inf, rejected
 
 
-def _refined(
-    scene: Scene, best: Hypothesis, first: int, known: _Known, margin: float, rejected: dict[int, list[Candidate]],
+def _told(
+    scene: Scene, stories: list[Story], first: int, margin: float, rejected: dict[int, list[Candidate]],
     config: TrackConfig, toss: int, camera: str, object_frame: str, frames: Sequence[RgbdFrame],
 ) -> TossTrack:  # fmt: skip
-    """Joint refinement of all tracked views, once more where depth and colour differ in time; then flags."""
-    n, all_views = len(scene.times_s), len(scene.store)
-    use = np.isfinite(best.poses[:n, 0, 0])
-    fixed = np.arange(all_views) >= n
-    fixed[first] = known.model is None or known.start is not None
-    poses, center_m = best.poses, scene.center_m
-    still = np.array([0 < i < n and use[i] and use[i - 1] and scene.store.stands_still(i - 1, i)
-                      for i in range(all_views)])  # fmt: skip
-    whose = np.maximum(np.arange(all_views) - n + 1, 0)  # a model's views follow each other in no time
-    times_s = np.concatenate([scene.times_s, np.zeros(all_views - n)])
-    drawn = np.array([scene.store.usable(i) for i in range(n, all_views)], dtype=bool)
-    delayed = any(c is not None and abs(c.depth_delay_s) > LEAST_DELAY_S for c in scene.store.crops)
-    for _ in range(2 if delayed else 1):
-        if delayed:
-            use &= put_at_color_times(scene, poses[:n], use)
-        center_m = center_of_mass(poses[:n], use, scene)
-        motion = Motion(times_s, whose, scene.gravity_camera_m_s2, center_m, still)
-        joint = refine(scene.store, poses, np.concatenate([use, drawn]), fixed, motion, config.graph)
-        poses = joint.poses
-    cost, on = (figure[:n] for figure in per_view(joint.pairs, joint.figures, all_views))
-    lost = ~use | (cost > config.flags.tracked_cost)
-    lost[first] &= not fixed[first]
-    poses, status, covariance = flagged(poses[:n], joint.covariance[:n], lost, scene, config.flags)
+    """The best story with honest flags."""
+    n, best = len(scene.times_s), stories[0]
+    joint = best.joint
+    cost, on = (figure[:n] for figure in per_view(joint.pairs, joint.figures, len(scene.store)))
+    lost = ~best.use | (cost > config.flags.tracked_cost)
+    lost[first] &= not best.fixed[first]
+    twists = joint.covariance[:n]
+    for other in stories[1:]:
+        apart = other.badness - best.badness
+        twists = twists + doubt(joint.poses[:n], other.joint.poses[:n], apart, config.flags)
+    poses, status, covariance = flagged(joint.poses[:n], twists, lost, scene, config.flags)
     times_ns = np.array([f.time_ns for f in frames], dtype=np.int64)
     track = ObjectTrack(toss, camera, object_frame, times_ns, poses, status, covariance)
-    keyframes = tuple(i for i in sorted(best.keyframes) if i < n and not lost[i])
+    keyframes = tuple(i for i in sorted(best.told.keyframes) if i < n and not lost[i])
     pairs = joint.pairs[(joint.pairs < n).all(1)]
-    return TossTrack(track, cost, on, keyframes, pairs, rejected, center_m, margin, scene.store)
+    for other in stories[1:]:
+        if apart_deg(joint.poses[:n], other.joint.poses[:n]) > config.story.agreeing_deg:
+            margin = min(margin, other.badness - best.badness)
+    return TossTrack(track, cost, on, keyframes, pairs, rejected, best.center_m, margin, scene.store)

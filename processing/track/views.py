@@ -33,8 +33,14 @@ class ViewConfig:
     """Blur of the smooth grey level, which widens the basin of attraction."""
     shade_px: float = 5.0
     """Scale over which brightness is levelled: shading and exposure are no texture."""
-    color_gain: float = 1.5
-    """Of colour differences against brightness."""
+    bright_gain: float = 0.5
+    """Of levelled brightness: shadows and highlights stay with the room and mislead."""
+    color_gain: float = 3.0
+    """Of colour differences: shading leaves them alone, so that a faint one tells more than a strong shadow."""
+    jump_m: float = 0.015
+    """A step of depth inside the outline (beyond a slope's): near it, the far surface gets the near one's depth ..."""
+    jump_px: int = 3
+    """... so that no samples are taken so near to it (they would stay with the picture, not with the object)."""
     samples: int = 500
     """Surface points of a view that alignment uses."""
     least_samples: int = 40
@@ -111,12 +117,11 @@ def cut(
     `colorless` marks pixels of the mask that show something else's colour."""
     straight_mask = optics.straight(mask.astype(np.uint8), smooth=False) > 0
     rows, columns = np.flatnonzero(straight_mask.any(1)), np.flatnonzero(straight_mask.any(0))
+    h, w = straight_mask.shape
     if len(rows) == 0 or int(straight_mask.sum()) < config.least_samples:
         return None
-    h, w = straight_mask.shape
-    top, bottom = max(rows[0] - config.margin_px, 0), min(rows[-1] + config.margin_px + 1, h)
-    left, right = max(columns[0] - config.margin_px, 0), min(columns[-1] + config.margin_px + 1, w)
-    left, top = int(left), int(top)
+    top, bottom = max(int(rows[0]) - config.margin_px, 0), min(int(rows[-1]) + config.margin_px + 1, h)
+    left, right = max(int(columns[0]) - config.margin_px, 0), min(int(columns[-1]) + config.margin_px + 1, w)
     area = np.s_[top:bottom, left:right]
     color = optics.straight(frame.color_rgb, smooth=True)[area].astype(np.float32) / np.float32(255.0 * gain)
     depth_m = np.ascontiguousarray(optics.straight(frame.depth_m, smooth=False)[area])
@@ -256,7 +261,7 @@ def _looks(crop: Crop, config: ViewConfig) -> Float32[Array, "h w 6"]:
     gray = 0.299 * red + 0.587 * green + 0.114 * blue
     total = red + green + blue + 0.1
     looks = (
-        gray / (_masked_blur(gray, weight, config.shade_px) + 0.03) - 1.0,
+        config.bright_gain * (gray / (_masked_blur(gray, weight, config.shade_px) + 0.03) - 1.0),
         config.color_gain * (red - green) / total,
         config.color_gain * (blue - 0.5 * (red + green)) / total,
     )
@@ -273,10 +278,21 @@ def _masked_blur(image: Float32[Array, "h w"], weight: Float32[Array, "h w"], si
     return above / np.maximum(cv2.GaussianBlur(weight, (0, 0), sigma_px), 1e-3)
 
 
+def _near_jumps(depth_m: Float32[Array, "h w"], slope: float, config: ViewConfig) -> Bool[Array, "h w"]:
+    """Pixels close to a step of depth between two surfaces of the object."""
+    seen = depth_m > 0
+    small = np.ones((3, 3), np.uint8)
+    high = cv2.dilate(depth_m, small)
+    low = cv2.erode(np.where(seen, depth_m, np.float32(1e3)), small)
+    steps = (seen & (high - low > config.jump_m + slope * depth_m)).astype(np.uint8)
+    wide = np.ones((2 * config.jump_px + 1, 2 * config.jump_px + 1), np.uint8)
+    return np.asarray(cv2.dilate(steps, wide) > 0)
+
+
 def _samples(
     pixels: Float32[Array, "h w c"], rays: Float[Array, "4"], config: ViewConfig, seed: int
 ) -> Float32[Array, "n s"]:
-    v, u = np.nonzero(pixels[..., k.Z] > 0)
+    v, u = np.nonzero((pixels[..., k.Z] > 0) & ~_near_jumps(pixels[..., k.Z], 5.0 * float(rays[0]), config))
     order = np.random.default_rng(seed).permutation(len(u))[: config.samples]
     u, v = u[order], v[order]
     seen = pixels[v, u]

@@ -1,0 +1,102 @@
+"""Stories of a toss: all its poses after joint refinement, how badly they fit, and which of several to believe."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from jaxtyping import Bool, Float
+from numpy import ndarray as Array
+
+from processing.track.beam import LEAST_DELAY_S, Hypothesis, Scene
+from processing.track.delay import put_at_color_times
+from processing.track.flags import per_view
+from processing.track.graph import GraphConfig, Motion, Refined, refine, steady_motion
+from processing.track.middle import center_of_mass
+from processing.track.motion import MotionConfig, change_cost, turn_between
+
+
+@dataclass(frozen=True)
+class StoryConfig:
+    """How stories are refined and compared."""
+
+    graph: GraphConfig = field(default_factory=GraphConfig)
+    steady: GraphConfig = field(default_factory=steady_motion)
+    """Refinement that trusts steady motion more than what the images say."""
+    agreeing_deg: float = 4.0
+    """Two stories of the same frames that differ by less are one."""
+    motion: MotionConfig = field(default_factory=MotionConfig)
+
+
+@dataclass(frozen=True, eq=False)
+class Story:
+    """One story after joint refinement. `badness`: mean cost of the views and of the changes of motion."""
+
+    told: Hypothesis
+    use: Bool[Array, " n"]
+    fixed: Bool[Array, " v"]
+    joint: Refined
+    center_m: Float[Array, "3"]
+    motion: Motion
+    badness: float
+
+
+def settled(scene: Scene, stories: list[Hypothesis], first: int, keep_first: bool, config: StoryConfig) -> list[Story]:
+    """The stories after joint refinement, best first. Where they agree the first will do; where they do not, the images
+    leave a turn open (that of a mug about its axis), and a refinement that trusts steady motion first is tried too."""
+    n = len(scene.times_s)
+    apart = max((apart_deg(stories[0].poses[:n], s.poses[:n]) for s in stories[1:]), default=0.0)
+    if apart < config.agreeing_deg:
+        return [refined(scene, stories[0], first, keep_first, config)]
+    steady = replace(config, graph=config.steady)
+    out = sorted((refined(scene, s, first, keep_first, config) for s in stories), key=lambda s: s.badness)
+    smooth = refined(scene, replace(out[0].told, poses=out[0].joint.poses), first, keep_first, steady)
+    out.append(refined(scene, replace(smooth.told, poses=smooth.joint.poses), first, keep_first, config))
+    return sorted(out, key=lambda s: s.badness)
+
+
+def apart_deg(one: Float[Array, "n 4 4"], other: Float[Array, "n 4 4"]) -> float:
+    """Largest turn between two stories' poses of a frame."""
+    both = np.flatnonzero(np.isfinite(one[:, 0, 0]) & np.isfinite(other[:, 0, 0]))
+    turns = [float(np.linalg.norm(turn_between(one[i], other[i]))) for i in both]
+    return float(np.degrees(max(turns, default=0.0)))
+
+
+def refined(scene: Scene, best: Hypothesis, first: int, keep_first: bool, config: StoryConfig) -> Story:
+    """Joint refinement of all tracked views, once more where depth and colour differ in time."""
+    n, all_views = len(scene.times_s), len(scene.store)
+    use = np.isfinite(best.poses[:n, 0, 0])
+    fixed = np.arange(all_views) >= n
+    fixed[first] = keep_first
+    poses = best.poses
+    still = np.array([0 < i < n and use[i] and use[i - 1] and scene.store.stands_still(i - 1, i)
+                      for i in range(all_views)])  # fmt: skip
+    whose = np.maximum(np.arange(all_views) - n + 1, 0)  # a model's views follow each other in no time
+    times_s = np.concatenate([scene.times_s, np.zeros(all_views - n)])
+    drawn = np.array([scene.store.usable(i) for i in range(n, all_views)], dtype=bool)
+    delayed = any(c is not None and abs(c.depth_delay_s) > LEAST_DELAY_S for c in scene.store.crops)
+    for _ in range(2 if delayed else 1):
+        if delayed:
+            use = use & put_at_color_times(scene, poses[:n], use)
+        center_m = center_of_mass(poses[:n], use, scene)
+        motion = Motion(times_s, whose, scene.gravity_camera_m_s2, center_m, still)
+        joint = refine(scene.store, poses, np.concatenate([use, drawn]), fixed, motion, config.graph)
+        poses = joint.poses
+    fit = np.nanmean(per_view(joint.pairs, joint.figures, all_views)[0][:n]) if len(joint.pairs) else 0.0
+    price = mean_price(joint.poses[:n], use, scene, center_m, config.motion)
+    return Story(best, use, fixed, joint, center_m, motion, float(fit + price))
+
+
+def mean_price(
+    poses: Float[Array, "n 4 4"], use: Bool[Array, " n"], scene: Scene, center_m: Float[Array, "3"],
+    config: MotionConfig,
+) -> float:  # fmt: skip
+    """Mean over the used frames of what the changes of motion cost."""
+    index, t = np.flatnonzero(use), scene.times_s
+    prices = [
+        change_cost(
+            (poses[a], poses[b], poses[c]), (t[b] - t[a], t[c] - t[b]), center_m, scene.gravity_camera_m_s2, config
+        )
+        for a, b, c in zip(index, index[1:], index[2:])
+    ]
+    return float(np.sum(prices) / max(len(index), 1))
