@@ -9,6 +9,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from processing import backends
 from processing.given_masks import add_masks_argument
 from processing.variants import CONTACT_ONLY, DEFAULT, NAMES, TRACKERS, rows_of
 from recordings.console import Outcome, Parser, command_parser, progress_for, run_command
@@ -60,6 +61,7 @@ def _parser() -> Parser:
         "--executor", choices=("local", "slurm"), default="local", help="where several sessions run (local processes)"
     )
     add_masks_argument(parser)
+    backends.add_arguments(parser)
     import_module(CONTACT).add_arguments(parser)
     parser.set_defaults(work=_work)
     return parser
@@ -115,6 +117,7 @@ def _refuse_what_is_not_there(args: argparse.Namespace) -> None:
         raise BadInput("--model RESULTS is a row of its own (with-model): leave out --variant")
     if args.model is not None and args.start is not None:
         raise BadInput("--start and --model exclude each other: a learned shape brings its own object frame")
+    backends.chosen(args)
     if args.device == "cuda":
         _refuse_missing_gpu()
 
@@ -197,7 +200,7 @@ def config_of(args: argparse.Namespace) -> Config:
     """The pipeline's settings that the command line asks for; everything else stays as it is by default."""
     from processing.config import Config
 
-    return Config(given_masks=args.masks)
+    return Config(given_masks=args.masks, backends=backends.chosen(args))
 
 
 def _evaluate(args: argparse.Namespace, session: Session, out: Path) -> Outcome:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from processing.backends import Backends
 from processing.contact.from_tracks import TracksConfig
 from processing.field.learn import LearnConfig
 from processing.given_masks import DEFAULT_MASKS, GivenMasks
 from processing.joint import JointConfig
 from processing.rig import RigSettings
 from processing.second_pass import CycleConfig
-from processing.segment.background import BackgroundSettings
+from processing.segment.follow import BackgroundSettings
 from processing.segment.static_scene import SceneSettings
 from processing.track.frame_to_model import FrameToModelSettings
 from processing.track.register import RegisterConfig
@@ -21,6 +22,7 @@ from processing.track.sequence import TrackConfig
 class Config:
     """What each stage is run with; saved beside its result in stage.json."""
 
+    backends: Backends = field(default_factory=Backends)
     scene: SceneSettings = field(default_factory=SceneSettings)
     rig: RigSettings = field(default_factory=RigSettings)
     masks: BackgroundSettings = field(default_factory=BackgroundSettings)

@@ -10,14 +10,17 @@ import json
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
+from processing.backends import make_matcher, settings_of
 from processing.config import Config
 from processing.cycle import Pass, place_stage, run_cycle
 from processing.frames import corrected_frames
 from processing.masks import object_masks, static_scene
 from processing.segment.static_scene import StaticScene
-from processing.stage import Counts, Done, Store, locked
+from processing.stage import Counts, Done, Store, locked, plain
 from processing.start_pose import StartPose
 from processing.table_plane import with_table_from_depth
 from processing.track.frame_to_model import FrameToModel
@@ -45,6 +48,9 @@ from recordings.results import (
 from recordings.session import RgbdFrames, Session
 from recordings.session_writer import file_sha256
 
+if TYPE_CHECKING:
+    from processing.track.features import FeatureMatcher
+
 MakeProgress = Callable[[str], Progress]
 
 
@@ -67,6 +73,15 @@ class Run:
     def camera(self) -> CameraModel:
         """The camera that everything is tracked in."""
         return self.session.calibration.camera(CAMERA)
+
+    @cached_property
+    def matcher(self) -> FeatureMatcher:
+        """Who matches features."""
+        return make_matcher(self.config.backends, self.device)
+
+    def matcher_settings(self, config: Any) -> dict[str, Any]:
+        """The settings of a stage that matches features: its own, and the matcher where it is not the default."""
+        return {**plain(config), **settings_of(self.config.backends.matcher, self.config.backends)}
 
     def frames(self, toss: int) -> RgbdFrames:
         """A toss's frames as vision sees them, depth in true metres."""

@@ -14,7 +14,7 @@ from processing.icp import IcpConfig, align_frames, count_verdicts
 from processing.judge import JudgeConfig
 from processing.reproject import RendererName, make_renderer
 from processing.reprojected import RedrawConfig, SecondFrames
-from processing.stage import Counts, Done, plain
+from processing.stage import Counts, Done
 from processing.track.multi_hypothesis import read_toss_track, write_toss_track
 from processing.track.register import register_tosses
 from processing.track.sequence import track_toss
@@ -139,12 +139,12 @@ def second_tracks(run: Run, name: str, drawn: Done, shape: Done, masks: Mapping[
             tosses.append(read_toss_track(done.folder, toss, frames, frames.masks, run.camera, sure,
                                           run.config.track, run.session.calibration.find("world", CAMERA)))  # fmt: skip
         progress = run.progress(f"{name}: all tosses together again")
-        together = register_tosses(tosses, run.config.register, progress, together=True)
+        together = register_tosses(tosses, run.config.register, progress, run.matcher, together=True)
         for track in together.tracks:
             write_track(folder, track)
         return {"fit": [round(float(f), 4) for f in together.fit]}
 
-    config = {"register": plain(run.config.register), "together": True}
+    config = {"register": run.matcher_settings(run.config.register), "together": True}
     return {**tracks, **dict.fromkeys(seen, run.store.run("register", 1, config, inputs, compute))}
 
 
@@ -175,13 +175,14 @@ def _second_track(run: Run, toss: int, drawn: Done, shape: Done, masks: Done) ->
             object_frame=before.object_frame,
             confidence=read_masks(masks.folder, toss).confidence,
             world_from_camera=run.session.calibration.find("world", CAMERA),
+            matcher=run.matcher,
             colorless=frames.colorless,
             **given,
         )
         write_toss_track(folder, tracked)
         return {"frames": len(frames), "lost": int(tracked.track.lost.sum())}
 
-    config = {"track": plain(run.config.track), "start": run.config.cycle.start}
+    config = {"track": run.matcher_settings(run.config.track), "start": run.config.cycle.start}
     return run.store.run("track", 2, config, inputs, compute)
 
 

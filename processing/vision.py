@@ -11,10 +11,12 @@ import numpy as np
 from processing.field.learn import LearnConfig, TossViews, learn_shape
 from processing.stage import Counts, Done
 from processing.track.multi_hypothesis import read_toss_track, write_toss_track
+from processing.track.notes import notes_of
 from processing.track.register import register_tosses
 from processing.track.sequence import track_toss
 from recordings.results import read_masks, read_shape, read_track, write_shape, write_track
 from recordings.session_writer import file_sha256
+from recordings.track_notes import write_notes
 from recordings.tracks import ObjectTrack, Status
 
 if TYPE_CHECKING:
@@ -44,13 +46,15 @@ def track_stage(run: Run, toss: int, masks: Done) -> Done:
             object_frame=f"object_{name}" if start is None else "object",
             confidence=seen.confidence,
             world_from_camera=run.session.calibration.find("world", CAMERA),
+            matcher=run.matcher,
             start=None if start is None else start.camera_from_object,
             start_frame=None if start is None else start.frame,
         )
         write_toss_track(folder, tracked)
+        write_notes(folder, toss, *notes_of(tracked, run.matcher))
         return _count(tracked.track)
 
-    return run.store.run("track", 2, run.config.track, inputs, compute)
+    return run.store.run("track", 2, run.matcher_settings(run.config.track), inputs, compute)
 
 
 def model_stage(run: Run, model: Path) -> Done:
@@ -82,12 +86,14 @@ def model_track_stage(run: Run, toss: int, masks: Done, model: Done) -> Done:
             object_frame=shape.object_frame,
             confidence=seen.confidence,
             world_from_camera=run.session.calibration.find("world", CAMERA),
+            matcher=run.matcher,
             model=shape,
         )
         write_toss_track(folder, tracked)
+        write_notes(folder, toss, *notes_of(tracked, run.matcher))
         return _count(tracked.track)
 
-    return run.store.run("track", 2, run.config.track, inputs, compute)
+    return run.store.run("track", 2, run.matcher_settings(run.config.track), inputs, compute)
 
 
 def register_stage(run: Run, tracks: dict[int, Done], masks: dict[int, Done]) -> Done:
@@ -109,13 +115,13 @@ def register_stage(run: Run, tracks: dict[int, Done], masks: dict[int, Done]) ->
                 )
             )
         progress = run.progress("one object frame")
-        together = register_tosses(tosses, run.config.register, progress, together=bool(run.starts))
+        together = register_tosses(tosses, run.config.register, progress, run.matcher, together=bool(run.starts))
         counts = {"not_joined": [t for t, joined in zip(run.tosses, together.joined, strict=True) if not joined]}
         for track, joined in zip(together.tracks, together.joined, strict=True):
             write_track(folder, replace(track if joined else lost_track(track), object_frame="object"))
         return {**counts, "fit": [round(float(f), 4) if np.isfinite(f) else None for f in together.fit]}
 
-    return run.store.run("register", 1, run.config.register, inputs, compute)
+    return run.store.run("register", 1, run.matcher_settings(run.config.register), inputs, compute)
 
 
 def field_stage(run: Run, name: str, tracks: dict[int, Done], masks: dict[int, Done]) -> Done:
