@@ -109,7 +109,7 @@ def against_truth(figure: Figure4, true_world_from_object: Mapping[int, PoseSeri
             left_out[toss] = "no true poses"
             continue
         moved = true.turned(level, figure.plane.offset_m)
-        series.append(_met(moved, done.start_time_s[i], done.start.rotation[i], done.start.position_m[i]))
+        series.append(met(moved, done.start_time_s[i], done.start.rotation[i], done.start.position_m[i]))
         kept.append(i)
     if not kept:
         raise BadInput("none of the tosses that were rolled out has true poses")
@@ -126,7 +126,7 @@ def against_truth(figure: Figure4, true_world_from_object: Mapping[int, PoseSeri
     return replace(figure, truth=truth, learning=learning)
 
 
-def _met(true: PoseSeries, time_s: float, rotation: Float[Array, "3 3"], position_m: Float[Array, "3"]) -> PoseSeries:
+def met(true: PoseSeries, time_s: float, rotation: Float[Array, "3 3"], position_m: Float[Array, "3"]) -> PoseSeries:
     """True poses from the rollout's first frame on, of the body that is rolled out: moved on the object's side."""
     times = np.concatenate([[time_s], true.time_s[true.time_s > time_s + 1e-6]])
     part = resampled(true, np.minimum(times, true.time_s[-1]))
