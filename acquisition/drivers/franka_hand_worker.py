@@ -10,7 +10,7 @@ import struct
 import sys
 import threading
 import time
-from typing import Any
+from typing import Any, NoReturn
 
 from acquisition.drivers.worker import WorkerEnd
 
@@ -74,18 +74,18 @@ def obey(end: WorkerEnd, gripper: Any, message: dict[str, Any]) -> None:
     end.event("acknowledged", sent=sent, acknowledged=time.monotonic_ns(), succeeded=succeeded, error=error)
 
 
-def main() -> int:
+def main() -> NoReturn:
     end = WorkerEnd()
     try:
         from panda_py import libfranka
     except ImportError as missing:
         end.event("failed", kind="missing", reason=str(missing))
-        return 1
+        end.leave()
     try:
         gripper = libfranka.Gripper(sys.argv[1])
     except RuntimeError as error:
         end.event("failed", kind="connect", reason=str(error))
-        return 1
+        end.leave()
     end.event("open", version=gripper.server_version())
     reader = Reader(end, gripper)
     reader.start()
@@ -100,4 +100,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import sys
 import time
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 from jaxtyping import Float
@@ -164,28 +164,27 @@ def _reason(state: Any) -> str:
     return ", ".join(flags)
 
 
-def main() -> int:
+def main() -> NoReturn:
     end = WorkerEnd()
     host, realtime = sys.argv[1], sys.argv[2]
     try:
         from panda_py import libfranka
     except ImportError as missing:
         end.event("failed", kind="missing", reason=str(missing))
-        return 1
+        end.leave()
     try:
         config = {"ignore": libfranka.RealtimeConfig.kIgnore, "enforce": libfranka.RealtimeConfig.kEnforce}[realtime]
         robot = libfranka.Robot(host, config)
     except RuntimeError as error:
         end.event("failed", kind="connect", reason=str(error))
-        return 1
+        end.leave()
     end.event("open", version=robot.server_version())
     try:
         ArmLoop(end, libfranka, robot).run()
     except RuntimeError as error:
         end.event("lost", reason=str(error))
-        return 1
-    return 0
+    end.leave()
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import sys
 import time
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 from jaxtyping import Float
@@ -201,7 +201,7 @@ class Follower:
         return True
 
 
-def main() -> int:
+def main() -> NoReturn:
     end = WorkerEnd()
     host, options = sys.argv[1], json.loads(sys.argv[2])
     try:
@@ -210,7 +210,7 @@ def main() -> int:
         import rtde_receive
     except ImportError as missing:
         end.event("failed", kind="missing", reason=str(missing))
-        return 1
+        end.leave()
     try:
         dashboard = dashboard_client.DashboardClient(host)
         dashboard.connect()
@@ -232,4 +232,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -8,6 +8,7 @@ Both ways go frames of one letter, a length and a payload: `J` is a JSON object,
 
 from __future__ import annotations
 
+import fcntl
 import gc
 import json
 import os
@@ -16,6 +17,7 @@ import struct
 import subprocess
 import sys
 import threading
+import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -25,6 +27,9 @@ from acquisition.devices import DeviceLost
 
 _HEAD = struct.Struct("<cI")
 STDERR_LINES = 20
+PIPE_BYTES = 1 << 20
+KEPT_BYTES = 1 << 22
+LEAVE_S = 0.5
 STOP_S = 1.5
 
 
@@ -108,26 +113,47 @@ class Worker:
 
 
 class WorkerEnd:
-    """The child's end. Commands are looked at between two states, so nothing here waits unless told to."""
+    """The child's end. Commands are looked at between two states, so nothing here waits unless told to.
+
+    What the driver does not take in time is kept, up to KEPT_BYTES; then states are given up (their numbers show it),
+    because a control loop that waits for a busy recorder is worse.
+    """
 
     def __init__(self) -> None:
         self._out = os.dup(1)
         os.dup2(2, 1)  # whatever the vendor's library prints must not meet the frames
+        os.set_blocking(self._out, False)
+        if hasattr(fcntl, "F_SETPIPE_SZ"):
+            fcntl.fcntl(self._out, fcntl.F_SETPIPE_SZ, PIPE_BYTES)
+        self._waiting = bytearray()
         self._in = 0
         self._writing = threading.Lock()
         gc.disable()  # no pauses in a 1 kHz loop; nothing here makes cycles
 
     def emit(self, kind: bytes, payload: bytes) -> None:
-        data = _frame(kind, payload)
         with self._writing:
-            while data:
-                data = data[os.write(self._out, data) :]
+            if kind == b"J" or len(self._waiting) < KEPT_BYTES:
+                self._waiting += _frame(kind, payload)
+            self._flush()
+
+    def _flush(self) -> None:
+        while self._waiting:
+            try:
+                sent = os.write(self._out, self._waiting)
+            except BlockingIOError:
+                return
+            del self._waiting[:sent]
 
     def event(self, event: str, **detail: Any) -> None:
         self.emit(b"J", json.dumps({"event": event, **detail}).encode())
 
     def leave(self) -> NoReturn:
         """End the process now: threads inside the vendor's library may still be waiting for an answer."""
+        end_s = time.monotonic() + LEAVE_S
+        while self._waiting and time.monotonic() < end_s:
+            with self._writing:
+                self._flush()
+            time.sleep(0.001)
         os._exit(0)
 
     def waiting(self) -> bool:
@@ -136,12 +162,25 @@ class WorkerEnd:
 
     def commands(self, timeout_s: float = 0.0) -> Iterator[tuple[dict[str, Any], bytes]]:
         """What has arrived, waiting at most `timeout_s` for the first. The driver's end reads as a "quit"."""
-        while select.select([self._in], [], [], timeout_s)[0]:
+        while self._command_within(timeout_s):
             message = self._message()
             yield message
             if message[0]["do"] == "quit":
                 return
             timeout_s = 0.0
+
+    def _command_within(self, timeout_s: float) -> bool:
+        """Wait for a command, and hand over meanwhile what the driver had no time for."""
+        end_s = time.monotonic() + timeout_s
+        while True:
+            with self._writing:
+                self._flush()
+            full = [self._out] if self._waiting else []
+            left_s = max(0.0, end_s - time.monotonic())
+            if select.select([self._in], full, [], left_s)[0]:
+                return True
+            if time.monotonic() >= end_s:
+                return False
 
     def _message(self) -> tuple[dict[str, Any], bytes]:
         head = self._exactly(_HEAD.size)
