@@ -19,13 +19,15 @@ from processing.contact.learn import ContactConfig, Plane, learn_contact, prepar
 from processing.contact.loss import Weights
 from processing.contact.motion import PoseSeries
 from processing.contact.prior import Prior, prior_from_shape
-from processing.contact.support import CAP_M2, trimmed_vertices, volume_m3
+from processing.contact.support import CAP_M2, surface_samples, trimmed_vertices, volume_m3
 from recordings.tracks import ObjectShape
 
 ClassName = Literal["hull", "nonconvex"]
 CLASSES: tuple[ClassName, ...] = get_args(ClassName)
 CONVEX = 0.06
 """A mesh that leaves up to this share of its trimmed hull empty counts as convex."""
+DEEP, DEEP_SHARE = 0.06, 0.02
+"""A notch is deeper than this share of the mean extent; so little surface in notches counts as none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,13 +79,22 @@ def choose_geometry(
             "hull", None, "the mesh is not closed, so it has no volume to compare with its hull's", {}
         )
     hull = float(ConvexHull(trimmed_vertices(shape.vertices_m, shape.faces)).volume)
-    empty = 1 - inside / hull
-    if empty <= CONVEX:
-        return GeometryChoice("hull", empty, f"the mesh fills {100 * (1 - empty):.0f} % of its hull", {})
+    empty, deep = 1 - inside / hull, _deep_share(shape)
+    if empty <= CONVEX or deep <= DEEP_SHARE:
+        why = f"the mesh fills {100 * (1 - empty):.0f} % of its hull; {100 * deep:.1f} % of its surface lies deep in it"
+        return GeometryChoice("hull", empty, why, {})
     if len(series) < 4:
         why = f"the mesh leaves {100 * empty:.0f} % of its hull empty; too few tosses to test it on held-out ones"
         return GeometryChoice("nonconvex", empty, why, {})
     return _tested_choice(series, shape, physics, plane, config, sigmas_m, empty)
+
+
+def _deep_share(shape: ObjectShape) -> float:
+    """The share of the surface that lies deeper below the trimmed hull than bumps and spikes can explain."""
+    points, _ = surface_samples(shape.vertices_m, shape.faces, 3000)
+    planes = ConvexHull(trimmed_vertices(shape.vertices_m, shape.faces)).equations
+    below = -(points @ planes[:, :3].T + planes[:, 3]).max(1)
+    return float((below > DEEP * np.ptp(points, axis=0).mean()).mean())
 
 
 def _tested_choice(
