@@ -73,6 +73,61 @@ class Distance:
     sigma_m: float
 
 
+@dataclass(frozen=True)
+class Arc:
+    """Three poses of one body in time order on one ballistic arc: the centre of mass `center_m` (in the body) has the
+    acceleration of gravity and the body turns evenly. Weights (0..1) are those of a robust loss."""
+
+    poses: tuple[int, int, int]
+    steps_s: tuple[float, float]
+    center_m: Float[Array, "3"]
+    gravity_m_s2: Float[Array, "3"]
+    sigma_m_s2: float
+    sigma_rad_s2: float
+    weight: float = 1.0
+    turn_weight: float = 1.0
+
+
+def arc_terms(arcs: list[Arc], poses: Array) -> Terms:
+    """r = sqrt(w) (2 ((x2 - x1)/h2 - (x1 - x0)/h1) / (h1 + h2) - g) / sigma with x the centre of mass, and the same of
+    the turns log(R0' R1), log(R1' R2) with nothing in gravity's place."""
+    index = np.array([a.poses for a in arcs])
+    h = np.array([a.steps_s for a in arcs])
+    before, after = 2 / (h[:, 0] * h.sum(1)), 2 / (h[:, 1] * h.sum(1))
+    center = np.stack([a.center_m for a in arcs])
+    root_x = np.sqrt([a.weight for a in arcs]) / np.array([a.sigma_m_s2 for a in arcs])
+    root_w = np.sqrt([a.turn_weight for a in arcs]) / np.array([a.sigma_rad_s2 for a in arcs])
+    R = poses[index][..., :3, :3]
+    x = poses[index][..., :3, 3] + (R @ center[:, None, :, None])[..., 0]
+    phi = se3.log(se3.rotations(np.swapaxes(R[:, :2], -1, -2) @ R[:, 1:]).reshape(-1, 4, 4))[:, :3].reshape(-1, 2, 3)
+    shares = np.stack([before, -(before + after), after], axis=1)
+    residual = np.empty((len(arcs), 6))
+    residual[:, :3] = (shares[..., None] * x).sum(1) - np.stack([a.gravity_m_s2 for a in arcs])
+    residual[:, 3:] = after[:, None] * phi[:, 1] - before[:, None] * phi[:, 0]
+    residual *= np.concatenate([np.repeat(root_x[:, None], 3, 1), np.repeat(root_w[:, None], 3, 1)], axis=1)
+    right = _turn_jacobian_inverse(phi.reshape(-1, 3)).reshape(-1, 2, 3, 3)  # d log(A exp(e)) / d e
+    back = -_turn_jacobian_inverse(-phi.reshape(-1, 3)).reshape(-1, 2, 3, 3)  # d log(exp(-e) A) / d e
+    by_turn = [
+        -before[:, None, None] * back[:, 0],
+        after[:, None, None] * back[:, 1] - before[:, None, None] * right[:, 0],
+        after[:, None, None] * right[:, 1],
+    ]
+    jacobians = []
+    for i in range(3):
+        J = np.zeros((len(arcs), 6, 6))
+        J[:, :3, :3] = -(shares[:, i] * root_x)[:, None, None] * (R[:, i] @ se3.skew(center))
+        J[:, :3, 3:] = (shares[:, i] * root_x)[:, None, None] * R[:, i]
+        J[:, 3:, :3] = root_w[:, None, None] * by_turn[i]
+        jacobians.append(J)
+    return residual, jacobians, index
+
+
+def _turn_jacobian_inverse(phi: Float[Array, "n 3"]) -> Float[Array, "n 3 3"]:
+    """Inverse right Jacobian of SO(3) to second order."""
+    W = se3.skew(phi)
+    return np.eye(3) + 0.5 * W + W @ W / 12
+
+
 def prior_terms(priors: list[Prior], poses: Array) -> Terms:
     """r = root log(mean^-1 pose)."""
     index = np.array([[p.pose] for p in priors])

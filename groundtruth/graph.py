@@ -24,12 +24,14 @@ from groundtruth import se3
 from groundtruth.blocks import BlockPattern
 from groundtruth.factors import (
     CORNERS,
+    Arc,
     Between,
     Coordinate,
     Distance,
     Prior,
     Projection,
     Terms,
+    arc_terms,
     between_terms,
     coordinate_terms,
     distance_terms,
@@ -58,8 +60,10 @@ class SolverConfig:
     """Pixel residuals beyond this many standard deviations count linearly; None as TagSLAM, which trusts all."""
     least_gain: float = 1e-9
     """Stops when a step lowers the cost by less than this share."""
-    weakest: float = 1e-3
-    """A pose whose information (in 1/rad^2 or 1/m^2) is below this in some direction is not determined."""
+    weakest: float = 1e-6
+    """A pose whose information (in 1/rad^2 or 1/m^2) is below this is not determined. 0: never asked."""
+    loosest_rad: float = 0.5
+    """Nor is one that does not move, when its turn is known no better than this (standard deviation)."""
 
 
 @dataclass
@@ -75,6 +79,7 @@ class Graph:
     betweens: list[Between] = field(default_factory=list)
     coordinates: list[Coordinate] = field(default_factory=list)
     distances: list[Distance] = field(default_factory=list)
+    arcs: list[Arc] = field(default_factory=list)
 
     def add_pose(self, name: str, start: Float[Array, "4 4"], stamp_ns: int | None) -> int:
         """`stamp_ns` is None for what does not move: such poses are eliminated last, everything else in time order."""
@@ -86,14 +91,19 @@ class Graph:
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """`poses` (n, 4, 4); `reprojection_px` (m, 4) corner distances in pixels by projection; `iterations` used."""
+    """`poses` (n, 4, 4); `residuals_px` (m, 4, 2): projected minus seen, by projection; `iterations` used."""
 
     poses: Float[Array, "n 4 4"]
-    reprojection_px: Float[Array, "m 4"]
+    residuals_px: Float[Array, "m 4 2"]
     cost: float
     iterations: int
     information: sparse.csc_matrix
     order: Int[Array, " d"]
+
+    @property
+    def reprojection_px(self) -> Float[Array, "m 4"]:
+        """Corner distances in pixels."""
+        return np.linalg.norm(self.residuals_px, axis=-1)
 
 
 def solve(graph: Graph, config: SolverConfig) -> Solution:
@@ -117,7 +127,7 @@ def solve(graph: Graph, config: SolverConfig) -> Solution:
         if gain < config.least_gain:
             break
     _check_determined(graph, information, config, order)
-    return Solution(poses, system.corner_distances(poses), cost, used, information, order)
+    return Solution(poses, system.residuals_px(poses), cost, used, information, order)
 
 
 def covariances(solution: Solution, poses: Sequence[int]) -> Float[Array, "k 6 6"]:
@@ -181,12 +191,16 @@ def _check_determined(
         v = factor.solve(v)
         v /= np.linalg.norm(v)
     direction = scale * v
-    direction /= np.linalg.norm(direction)
-    weakest = float(direction @ (information @ direction))
-    if weakest < config.weakest:
-        share = np.abs(direction).reshape(-1, 6).max(1)
-        names = [graph.names[i] for i in np.argsort(-share)[:4] if share[i] > 0.3 * share.max()]
-        raise Undetermined(names, f"a direction has an information of only {weakest:.1e}")
+    sigma = 1 / np.sqrt(max(float(direction @ (information @ direction)), 1e-30))
+    turn_rad, shift_m = (np.linalg.norm(part, axis=1) * sigma for part in np.split(direction.reshape(-1, 6), 2, axis=1))
+    still = np.array([s is None for s in graph.stamps])
+    loose = still & (turn_rad > config.loosest_rad)
+    loose |= np.maximum(turn_rad, shift_m) > 1 / np.sqrt(max(config.weakest, 1e-30))
+    if config.weakest > 0 and loose.any():
+        first = [i for i in np.argsort(-turn_rad - shift_m) if loose[i]]
+        names = [graph.names[i] for i in sorted(first, key=lambda i: not still[i])[:4]]
+        turn, shift = np.degrees(turn_rad[loose].max()), shift_m[loose].max()
+        raise Undetermined(names, f"what was measured and assumed leaves {turn:.0f} deg and {shift:.2g} m open")
 
 
 def _weakest_name(graph: Graph, information: sparse.csc_matrix) -> str:
@@ -218,8 +232,8 @@ class _System:
             total += 0.5 * float((residuals**2).sum())
         return total if np.isfinite(total) else np.inf
 
-    def corner_distances(self, poses: Float[Array, "n 4 4"]) -> Float[Array, "m 4"]:
-        return np.linalg.norm(self._pixels(poses)[0], axis=-1)
+    def residuals_px(self, poses: Float[Array, "n 4 4"]) -> Float[Array, "m 4 2"]:
+        return self._pixels(poses)[0]
 
     def normal_equations(self, poses: Float[Array, "n 4 4"]) -> tuple[sparse.csc_matrix, Float[Array, " d"]]:
         """J' W J and -J' W r over all factors."""
@@ -292,4 +306,6 @@ class _System:
             out.append(coordinate_terms(self._graph.coordinates, poses))
         if self._graph.distances:
             out.append(distance_terms(self._graph.distances, poses))
+        if self._graph.arcs:
+            out.append(arc_terms(self._graph.arcs, poses))
         return out

@@ -50,6 +50,8 @@ class Observation:
     candidates: Float[Array, "k 4 4"]
     errors_px: Float[Array, " k"]
     area_px2: float
+    sigma_px: float | None = None
+    """Of a corner's coordinate, where the detector tells; None: the configuration's `pixel_noise`."""
 
     @property
     def rig_key(self) -> Key:

@@ -45,6 +45,13 @@ def log(poses: Float[Array, "n 4 4"]) -> Float[Array, "n 6"]:
     return np.concatenate([w, v], axis=-1)
 
 
+def rotations(turns: Float[Array, "*n 3 3"]) -> Float[Array, "*n 4 4"]:
+    """Poses with these rotations and no translation."""
+    out = np.zeros((*turns.shape[:-2], 4, 4))
+    out[..., :3, :3], out[..., 3, 3] = turns, 1.0
+    return out
+
+
 def left_jacobian(w: Float[Array, "n 3"]) -> Float[Array, "n 3 3"]:
     """J(w) = I + (1 - cos a)/a^2 [w] + (a - sin a)/a^3 [w]^2 with a = |w|; series near 0."""
     a = np.linalg.norm(w, axis=-1)[:, None, None]

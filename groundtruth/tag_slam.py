@@ -79,7 +79,7 @@ def run_tag_slam(
 def solve_at_once(problem: Problem, settings: TagSlamSettings, progress: Progress) -> TagSlamResult:
     """All stamps in one graph."""
     growth = Growth(problem, settings.grow)
-    _grow(problem, growth, settings, progress)
+    grow(problem, growth, settings, progress)
     graph, index = build_graph(problem, growth.poses, settings)
     if not graph.projections:
         raise Undetermined(sorted(_spoken(k) for k in growth.missing())[:3] or ["nothing"], _nothing_placed(problem))
@@ -105,7 +105,7 @@ def solve_with_amnesia(problem: Problem, settings: TagSlamSettings, progress: Pr
         alone = replace(problem, stamps=(*earlier, stamp), observations=tuple(seen.get(stamp, ())))
         growth = Growth(alone, settings.grow)
         growth.poses |= before
-        _grow(alone, growth, settings, Silent())
+        grow(alone, growth, settings, Silent())
         graph, index = build_graph(alone, growth.poses, settings)
         graph.priors += [Prior(index[key], pose, 1e3 * np.eye(6)) for key, pose in before.items()]
         answers.append(_result(replace(alone, stamps=(stamp,)), growth, index, solve(graph, settings.solver)))
@@ -132,7 +132,7 @@ def _joined(answers: list[TagSlamResult]) -> TagSlamResult:
     )
 
 
-def _grow(problem: Problem, growth: Growth, settings: TagSlamSettings, progress: Progress) -> None:
+def grow(problem: Problem, growth: Growth, settings: TagSlamSettings, progress: Progress) -> None:
     """Sweep until nothing more can be placed, bolder from stage to stage. What there is is solved in between."""
     solved_at, fixed_at = 0, growth.fixed()
     for stage in STAGES:
@@ -178,7 +178,9 @@ def build_graph(
         if all(k in index for k in keys):
             camera, rig, body, tag = (index[k] for k in keys)
             eye = _eye(config, o, camera, graph, eyes)
-            graph.projections.append(Projection(o.camera, eye, rig, body, tag, o.tag.size_m, o.corners_px, sigma))
+            graph.projections.append(
+                Projection(o.camera, eye, rig, body, tag, o.tag.size_m, o.corners_px, o.sigma_px or sigma)
+            )
     _add_odometry(problem, graph, index)
     _add_measurements(problem, graph, index)
     return graph, index

@@ -1,0 +1,388 @@
+"""Where the tagged body was in every frame of the ground-truth cameras: one factor graph over all tosses.
+
+Unknown are the body's pose at every instant, the place of each tag on it (its layout), the cameras' places as far as
+the calibration leaves them open, and how each camera moved from toss to toss. What is measured are tag corners; in
+flight three poses in a row lie on an arc, where the data do not say otherwise (a robust weight: hands, impacts).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from jaxtyping import Bool, Float, Int64
+from numpy import ndarray as Array
+
+from groundtruth import se3
+from groundtruth.factors import Arc, Between
+from groundtruth.graph import Graph, Solution, SolverConfig, Undetermined, covariances, solve
+from groundtruth.grow import Growth, chain
+from groundtruth.interpolate import GRAVITY_M_S2
+from groundtruth.problem import Key, Observation, Problem, camera_key, planar_poses, tag_key
+from groundtruth.session_sightings import Roles, Sightings, TagSeen
+from groundtruth.tag_slam import TagSlamSettings, build_graph, grow
+from groundtruth.tagslam_config import BodyEntry, CameraEntry, TagEntry, TagSlamConfig
+from groundtruth.tagslam_yaml import NoisyPose
+from recordings.progress import Progress, Silent
+from recordings.tracks import RigCalibration
+
+WORLD, BODY = "world", "tagged"
+FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+"""Between pupil-apriltags' tag frame (y down) and TagSLAM's (y up)."""
+
+
+@dataclass(frozen=True)
+class SolveConfig:
+    camera_sigma: tuple[float, float] = (0.001, 0.0005)
+    """Of a camera's place in the calibration, rad and m."""
+    table_sigma: tuple[float, float] = (0.005, 0.0005)
+    """Of a table tag's place, rad and m."""
+    layout_sigma: tuple[float, float] = (0.005, 0.0005)
+    """Of a tag's place on the body, where the layout is given."""
+    drift_sigma: tuple[float, float] = (0.0005, 0.0003)
+    """How far a camera may move from toss to toss without it being told, rad and m."""
+    corner_floor_px: float = 0.08
+    """Standard deviation that a corner has at least: lens and printing are not perfect."""
+    huber_px: float = 3.0
+    flat_deg: float = 12.0
+    """Tags seen flatter than this start nothing; their corners count."""
+    fall_m_s2: float = 0.6
+    """How far from gravity the acceleration of flight may be; beyond three times this an arc hardly counts."""
+    turn_rad_s2: float = 6.0
+    rounds: int = 3
+    """Of the arcs' robust weights."""
+
+
+@dataclass(frozen=True, eq=False)
+class BodyTrack:
+    """The body in one toss at its cameras' instants. Covariance: (rotation, translation) in the body's own frame.
+    `on_arc[k]`: poses k-1, k, k+1 are flight. `tags`, `cameras`: how many saw it."""
+
+    time_ns: Int64[Array, " n"]
+    world_from_tagged: Float[Array, "n 4 4"]
+    covariance: Float[Array, "n 6 6"]
+    on_arc: Bool[Array, " n"]
+    tags: tuple[int, ...]
+    cameras: tuple[int, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Corner:
+    """One tag's corners in one image against the solution: seen, and what is left (seen - projected)."""
+
+    toss: int
+    camera: str
+    time_ns: int
+    tag_id: int
+    seen_px: Float[Array, "4 2"]
+    left_px: Float[Array, "4 2"]
+    sigma_px: float
+
+
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """`layout`: tagged_from_tag (pupil-apriltags' tag frame). `cameras`: world_from_camera and its covariance.
+    `moved[(camera, toss)]`: how far it stood from its place, rad and m. `unplaced`: what nothing connects."""
+
+    tracks: Mapping[int, BodyTrack]
+    layout: Mapping[int, Float[Array, "4 4"]]
+    sizes_m: Mapping[int, float]
+    cameras: Mapping[str, Float[Array, "4 4"]]
+    camera_covariance: Mapping[str, Float[Array, "6 6"]]
+    moved: Mapping[tuple[str, int], tuple[float, float]]
+    center_m: Float[Array, "3"]
+    corners: tuple[Corner, ...]
+    unplaced: tuple[str, ...]
+    arcs: int = 0
+    noise_factor: float = field(default=1.0)
+
+
+def solve_session(
+    sightings: Sightings,
+    roles: Roles,
+    sizes_m: Mapping[int, float],
+    calibration: RigCalibration,
+    layout: Mapping[int, Float[Array, "4 4"]] | None = None,
+    config: SolveConfig | None = None,
+    progress: Progress | None = None,
+) -> Solved:
+    """Raises Undetermined, in words of cameras, tags and instants, where something is not fixed by what was seen."""
+    config, progress = config or SolveConfig(), progress or Silent()
+    problem = _problem(sightings, roles, sizes_m, calibration, layout, config)
+    growth = Growth(problem, TagSlamSettings().grow)
+    settings = TagSlamSettings(
+        solver=SolverConfig(huber_px=config.huber_px), growing_solver=SolverConfig(6, config.huber_px, weakest=0.0)
+    )
+    grow(problem, growth, settings, progress)
+    if not any(key[:2] == ("body", BODY) for key in growth.poses):
+        raise Undetermined(sorted(c.name for c in problem.config.cameras), _nothing_connects(problem, growth))
+    graph, index = build_graph(problem, growth.poses, settings)
+    order = _order(sightings, index)
+    drifting = _let_cameras_drift(graph, problem, index, sightings, config)
+    solution = solve(graph, settings.solver)
+    center = np.zeros(3)
+    for _ in range(config.rounds):
+        center = _center_of_mass(solution.poses, order, center)
+        graph.arcs = _arcs(solution.poses, order, center, config)
+        if not graph.arcs:
+            break
+        graph.start = list(solution.poses)
+        solution = solve(graph, settings.solver)
+    return _solved(problem, sightings, graph, index, solution, drifting, center, growth)
+
+
+def _nothing_connects(problem: Problem, growth: Growth) -> str:
+    placed = [c.name for c in problem.config.cameras if camera_key(c.name) in growth.poses]
+    if not placed:
+        return (
+            "no camera's place is known and none sees a table tag whose place is known; "
+            "run `toss-calibrate cameras SESSION` first"
+        )
+    return f"of the cameras with a known place ({', '.join(placed)}) none sees the tossed object's tags well enough"
+
+
+def _noise(sigma: tuple[float, float]) -> Float[Array, "6 6"]:
+    return np.diag([1 / sigma[0]] * 3 + [1 / sigma[1]] * 3)
+
+
+def _problem(
+    sightings: Sightings,
+    roles: Roles,
+    sizes_m: Mapping[int, float],
+    calibration: RigCalibration,
+    layout: Mapping[int, Float[Array, "4 4"]] | None,
+    config: SolveConfig,
+) -> Problem:
+    """The session as TagSLAM would see it: a static world with the cameras and the table, a moving tagged body."""
+    counts = {i: sum(s.tag.tag_id == i for s in sightings.seen) for i in roles.body}
+    reference = max(sorted(counts), key=lambda i: counts[i])
+    table = {t.tag_id: t for t in calibration.table_tags if t.tag_id in roles.table}
+    tags = {
+        i: TagEntry(i, t.size_m, NoisyPose(t.world_from_tag.matrix @ FLIP, _noise(config.table_sigma)))
+        for i, t in table.items()
+    }
+    tags |= {i: TagEntry(i, sizes_m[i], None) for i in roles.still if i in sizes_m}
+    world = BodyEntry(WORLD, True, NoisyPose(np.eye(4), 1e6 * np.eye(6)), 0.0, tags, frozenset())
+    if layout is not None:
+        on_body = {
+            i: TagEntry(i, sizes_m[i], NoisyPose(layout[i] @ FLIP, _noise(config.layout_sigma))) for i in roles.body
+        }
+    else:
+        on_body = {i: TagEntry(i, sizes_m[i], None) for i in roles.body}
+        on_body[reference] = replace(on_body[reference], pose=NoisyPose(FLIP, 1e6 * np.eye(6)))
+    body = BodyEntry(BODY, False, None, 0.0, on_body, frozenset())
+    names = sorted({camera for cameras in sightings.frames.values() for camera in cameras})
+    cameras = tuple(_camera(name, calibration, config) for name in names)
+    tagslam = TagSlamConfig(cameras, (world, body), None, 0.3, (), (), (), (), (), 2)
+    observations = _observations(sightings, tagslam, config)
+    stamps = tuple(sorted({o.stamp_ns for o in observations}))
+    every = {**tags, **on_body}
+    owner = {**dict.fromkeys(tags, world), **dict.fromkeys(on_body, body)}
+    return Problem(tagslam, stamps, observations, every, owner, {}, 0, 0)
+
+
+def _camera(name: str, calibration: RigCalibration, config: SolveConfig) -> CameraEntry:
+    model = calibration.camera(name)
+    place = calibration.find("world", model.frame)
+    known = None if place is None else NoisyPose(place.matrix, _noise(config.camera_sigma))
+    return CameraEntry(name, model, f"/{name}/image", WORLD, known, (1e-5, 1e-5))
+
+
+def _observations(sightings: Sightings, config: TagSlamConfig, settings: SolveConfig) -> tuple[Observation, ...]:
+    owner = {i: body for body in config.bodies for i in body.tags}
+    out: list[Observation] = []
+    for number, camera in enumerate(config.cameras):
+        mine = [s for s in sightings.seen if s.camera == camera.name and s.tag.tag_id in owner]
+        sizes = np.array([owner[s.tag.tag_id].tags[s.tag.tag_id].size_m for s in mine])
+        corners = np.array([s.tag.corners_px for s in mine]).reshape(-1, 4, 2)
+        for s, (poses, errors) in zip(mine, planar_poses(camera.model, sizes, corners), strict=True):
+            body = owner[s.tag.tag_id]
+            (ax, ay), (bx, by) = s.tag.corners_px[2] - s.tag.corners_px[0], s.tag.corners_px[3] - s.tag.corners_px[1]
+            out.append(
+                Observation(
+                    s.time_ns,
+                    number,
+                    config.bodies[0],
+                    body,
+                    body.tags[s.tag.tag_id],
+                    s.tag.corners_px,
+                    poses,
+                    errors,
+                    0.5 * abs(float(ax * by - ay * bx)),
+                    float(np.hypot(s.tag.sigma_px, settings.corner_floor_px)),
+                )
+            )
+    return tuple(out)
+
+
+Order = Mapping[int, tuple[Int64[Array, " n"], Int64[Array, " n"]]]
+"""Per toss: times (ns) and the numbers of the body's poses at them."""
+
+
+def _order(sightings: Sightings, index: Mapping[Key, int]) -> Order:
+    toss_of = {s.time_ns: s.toss for s in sightings.seen}
+    found: dict[int, list[tuple[int, int]]] = {toss: [] for toss in sightings.frames}
+    for key, number in index.items():
+        if key[:2] == ("body", BODY):
+            found[toss_of[key[2]]].append((key[2], number))
+    return {
+        toss: (np.array([t for t, _ in sorted(rows)], np.int64), np.array([n for _, n in sorted(rows)], np.int64))
+        for toss, rows in found.items()
+    }
+
+
+def _let_cameras_drift(
+    graph: Graph, problem: Problem, index: Mapping[Key, int], sightings: Sightings, config: SolveConfig
+) -> dict[tuple[str, int], int]:
+    """Each camera gets a pose of its own in each toss, tied to its place: a bumped one shows."""
+    if len(sightings.frames) < 2:
+        return {}
+    toss_of = {s.time_ns: s.toss for s in sightings.seen}
+    placed = [o for o in problem.observations if all(k in index for k in chain(problem, o))]
+    drifting: dict[tuple[str, int], int] = {}
+    for i, (o, p) in enumerate(zip(placed, graph.projections, strict=True)):
+        camera = problem.config.cameras[o.camera].name
+        toss = toss_of[o.stamp_ns]
+        if (camera, toss) not in drifting:
+            number = graph.add_pose(f"{camera} in toss {toss}", graph.start[p.rig_from_camera], None)
+            graph.betweens.append(Between(p.rig_from_camera, number, np.eye(4), _noise(config.drift_sigma)))
+            drifting[(camera, toss)] = number
+        graph.projections[i] = replace(p, rig_from_camera=drifting[(camera, toss)])
+    return drifting
+
+
+def _center_of_mass(poses: Float[Array, "n 4 4"], order: Order, center: Float[Array, "3"]) -> Float[Array, "3"]:
+    """c with p + R c falling: second differences of p + R c equal gravity in all triples that are nearly in flight now
+    (robust linear least squares). The old one where too little of the motion is flight."""
+    rows, values = [], []
+    for times, numbers in order.values():
+        for k in range(1, len(numbers) - 1):
+            h1, h2 = np.diff(times[k - 1 : k + 2]) / 1e9
+            if max(h1, h2) > 0.1:
+                continue
+            shares = np.array([2 / (h1 * (h1 + h2)), 0.0, 2 / (h2 * (h1 + h2))])
+            shares[1] = -shares.sum()
+            three = poses[numbers[k - 1 : k + 2]]
+            rows.append(np.einsum("i,ijk->jk", shares, three[:, :3, :3]))
+            values.append(GRAVITY_M_S2 - shares @ three[:, :3, 3])
+    if not rows:
+        return center
+    A, b = np.array(rows), np.array(values)
+    for _ in range(20):
+        left = np.linalg.norm(b - A @ center, axis=1)
+        weight = (left < 15.0) / (1 + (left / 1.5) ** 2) ** 2
+        information = np.einsum("n,nij,nik->jk", weight, A, A) + 100.0 * np.eye(3)  # 0.1 m about the frame's origin
+        center = np.linalg.solve(information, np.einsum("n,nij,ni->j", weight, A, b))
+    return center
+
+
+def _arcs(poses: Float[Array, "n 4 4"], order: Order, center: Float[Array, "3"], config: SolveConfig) -> list[Arc]:
+    """All triples of poses in a row, weighted by how nearly they are in flight (Geman and McClure)."""
+    arcs = []
+    for times, numbers in order.values():
+        h = np.diff(times) / 1e9
+        for k in range(1, len(numbers) - 1):
+            if max(h[k - 1], h[k]) > 0.1:
+                continue
+            three = (int(numbers[k - 1]), int(numbers[k]), int(numbers[k + 1]))
+            fall, turn = _off_arc(poses, three, (float(h[k - 1]), float(h[k])), center)
+            weight = 1 / (1 + (fall / (3 * config.fall_m_s2)) ** 2) ** 2
+            turn_weight = 1 / (1 + (turn / (3 * config.turn_rad_s2)) ** 2) ** 2
+            both = min(weight, turn_weight)
+            if both > 0.02:
+                steps = (float(h[k - 1]), float(h[k]))
+                arcs.append(Arc(three, steps, center, GRAVITY_M_S2, config.fall_m_s2, config.turn_rad_s2, both, both))
+    return arcs
+
+
+def _off_arc(
+    poses: Float[Array, "n 4 4"], three: tuple[int, int, int], h: tuple[float, float], center: Float[Array, "3"]
+) -> tuple[float, float]:
+    """How far a triple's acceleration is from gravity (m/s^2) and its turn from even (rad/s^2)."""
+    x = poses[list(three), :3, 3] + poses[list(three), :3, :3] @ center
+    R = poses[list(three), :3, :3]
+    spins = se3.log(se3.rotations(np.swapaxes(R[:2], -1, -2) @ R[1:]))[:, :3] / np.array(h)[:, None]
+    acceleration = 2 * ((x[2] - x[1]) / h[1] - (x[1] - x[0]) / h[0]) / sum(h)
+    fall = float(np.linalg.norm(acceleration - GRAVITY_M_S2))
+    return fall, float(np.linalg.norm(spins[1] - spins[0])) * 2 / sum(h)
+
+
+def _solved(
+    problem: Problem,
+    sightings: Sightings,
+    graph: Graph,
+    index: Mapping[Key, int],
+    solution: Solution,
+    drifting: Mapping[tuple[str, int], int],
+    center: Float[Array, "3"],
+    growth: Growth,
+) -> Solved:
+    order = _order(sightings, index)
+    poses = solution.poses
+    names = {c.name: index[camera_key(c.name)] for c in problem.config.cameras if camera_key(c.name) in index}
+    corners = _corners(problem, sightings, graph, index, solution)
+    factor = _noise_factor(corners)
+    wanted = [int(n) for _, numbers in order.values() for n in numbers] + list(names.values())
+    spread = dict(zip(wanted, covariances(solution, wanted) * factor**2, strict=True))
+    in_flight = {arc.poses[1] for arc in graph.arcs if min(arc.weight, arc.turn_weight) > 0.4}
+    seen_by: dict[int, list[TagSeen]] = {}
+    on_body = problem.config.body(BODY).tags
+    for s in sightings.seen:
+        if s.tag.tag_id in on_body:
+            seen_by.setdefault(s.time_ns, []).append(s)
+    tracks = {
+        toss: BodyTrack(
+            times,
+            poses[numbers],
+            np.array([spread[int(n)] for n in numbers]).reshape(-1, 6, 6),
+            np.array([int(n) in in_flight for n in numbers], dtype=bool),
+            tuple(len({s.tag.tag_id for s in seen_by[int(t)]}) for t in times),
+            tuple(len({s.camera for s in seen_by[int(t)]}) for t in times),
+        )
+        for toss, (times, numbers) in order.items()
+    }
+    return Solved(
+        tracks=tracks,
+        layout={i: poses[index[tag_key(i)]] @ FLIP for i in sorted(on_body) if tag_key(i) in index},
+        sizes_m={i: tag.size_m for i, tag in problem.tags.items()},
+        cameras={name: poses[number] for name, number in names.items()},
+        camera_covariance={name: spread[number] for name, number in names.items()},
+        moved={key: _apart(poses[names[key[0]]], poses[number]) for key, number in drifting.items()},
+        center_m=center,
+        corners=corners,
+        unplaced=tuple(" ".join(k[:2]) for k in growth.missing()),
+        arcs=len(in_flight),
+        noise_factor=factor,
+    )
+
+
+def _apart(a: Float[Array, "4 4"], b: Float[Array, "4 4"]) -> tuple[float, float]:
+    xi = se3.log((np.linalg.inv(a) @ b)[None])[0]
+    return float(np.linalg.norm(xi[:3])), float(np.linalg.norm(xi[3:]))
+
+
+def _corners(
+    problem: Problem, sightings: Sightings, graph: Graph, index: Mapping[Key, int], solution: Solution
+) -> tuple[Corner, ...]:
+    toss_of = {s.time_ns: s.toss for s in sightings.seen}
+    placed = [o for o in problem.observations if all(k in index for k in chain(problem, o))]
+    left = -solution.residuals_px
+    return tuple(
+        Corner(
+            toss_of[o.stamp_ns],
+            problem.config.cameras[o.camera].name,
+            o.stamp_ns,
+            o.tag.tag_id,
+            o.corners_px,
+            left[i],
+            graph.projections[i].sigma_px,
+        )
+        for i, o in enumerate(placed)
+    )
+
+
+def _noise_factor(corners: tuple[Corner, ...]) -> float:
+    """By how much the corners' residuals exceed their stated noise: robust, never below 1."""
+    scaled = np.concatenate([(c.left_px / c.sigma_px).ravel() for c in corners])
+    return max(1.0, 1.4826 * float(np.median(np.abs(scaled))))

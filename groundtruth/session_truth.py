@@ -1,0 +1,317 @@
+"""`toss-truth SESSION`: from the ground-truth cameras' images to the session's truth/ folder and a verdict."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import shutil
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Float, Int64
+from numpy import ndarray as Array
+
+from groundtruth import se3
+from groundtruth.answer import pose_rows, reprojection
+from groundtruth.interpolate import classify, interpolate
+from groundtruth.offset import Fit, object_from_tagged_by_mesh, tagged_frame
+from groundtruth.session_sightings import assign_roles, find_tags, measured_sizes_m, shared_times
+from groundtruth.session_solve import Solved, solve_session
+from groundtruth.verdict import Verdict, judge
+from recordings.errors import BadInput
+from recordings.geometry import Transform
+from recordings.progress import Progress, Silent
+from recordings.records import StampedPose
+from recordings.session import Session
+from recordings.session_writer import write_json, write_truth
+
+TRUTH = "truth"
+
+
+@dataclass(frozen=True, eq=False)
+class TruthConfig:
+    """`tag_size_m` None: measured between the cameras. `layout`: tagged_from_tag of the object's tags, where known."""
+
+    family: str = "tag36h11"
+    tag_size_m: float | None = None
+    ignored: frozenset[int] = frozenset()
+    layout: Mapping[int, Float[Array, "4 4"]] | None = None
+    layout_sizes_m: Mapping[int, float] | None = None
+    sync_s: float = 0.0005
+    """Images of different cameras nearer than this are one instant."""
+    size_trust: float = 0.01
+    """A given tag size may be wrong by this share; within it the measured one is taken."""
+    size_error: float = 0.0015
+    """The measured size is used when it is known better than this share (standard error)."""
+    tracked_m: float = 0.0015
+    tracked_rad: float = 0.01
+    """A pose is `tracked` when its standard deviations are below these, else `interpolated`."""
+
+
+@dataclass(frozen=True, eq=False)
+class TossTruth:
+    """The body at the D455's colour frames; NaN where lost. Covariances are in the world: (rotation, translation)."""
+
+    time_ns: Int64[Array, " n"]
+    world_from_tagged: Float[Array, "n 4 4"]
+    covariance: Float[Array, "n 6 6"]
+    status: tuple[Literal["tracked", "interpolated", "lost"], ...]
+
+
+@dataclass(frozen=True, eq=False)
+class SessionTruth:
+    solved: Solved
+    tosses: Mapping[int, TossTruth]
+    verdict: Verdict
+    sizes_m: Mapping[int, float]
+
+
+def find_truth(
+    session: Session, tosses: Sequence[int], config: TruthConfig | None = None, progress: Progress | None = None
+) -> SessionTruth:
+    """Detect, solve, smooth, interpolate, judge. Raises BadInput or Undetermined with what to do."""
+    config, progress = config or TruthConfig(), progress or Silent()
+    calibration = session.calibration
+    sightings = find_tags(session, tosses, config.family, camera_offsets_s(calibration.residuals), progress)
+    for camera in {c for cameras in sightings.frames.values() for c in cameras}:
+        calibration.camera(camera)
+    sightings, spread_ns = shared_times(sightings, round(config.sync_s * 1e9))
+    roles = assign_roles(sightings, calibration, config.ignored, config.layout)
+    measured = measured_sizes_m(sightings, calibration, roles.body | roles.still)
+    sizes, size_notes = _sizes(config, roles.body | roles.still, roles.body, measured)
+    solved = _in_tagged_frame(
+        solve_session(sightings, roles, sizes, calibration, config.layout, progress=progress), config
+    )
+    verdict = judge(solved, sightings, spread_ns, size_notes, calibration)
+    truths = {toss: _at_color_frames(session, toss, solved, config) for toss in tosses}
+    return SessionTruth(solved, truths, verdict, sizes)
+
+
+def camera_offsets_s(residuals: Mapping[str, Any]) -> dict[str, float]:
+    """Seconds to add to each ground-truth camera's stamps to be on the D455's clock, from calibration.json's
+    `residuals.time.offsets_s` (written by `toss-calibrate time`); none where it was not run."""
+    stored = residuals.get("time") or {}
+    offsets = stored.get("offsets_s") or {} if isinstance(stored, Mapping) else {}
+    return {str(name): float(value) for name, value in offsets.items()}
+
+
+def _sizes(
+    config: TruthConfig, ids: frozenset[int], body: frozenset[int], measured: Mapping[int, tuple[float, int]]
+) -> tuple[dict[int, float], list[str]]:
+    """Each tag's side, and notes. A given size is checked against what the cameras measure; their ratio is common."""
+    given = {i: s for i, s in (config.layout_sizes_m or {}).items() if i in body}
+    if config.tag_size_m is not None:
+        given |= dict.fromkeys(body - set(given), config.tag_size_m)
+    ratios = np.array([measured[i][0] / given[i] for i in sorted(given) if i in measured])
+    pairs = np.array([measured[i][1] for i in sorted(given) if i in measured])
+    sizes = {i: m for i, (m, _) in measured.items() if i in ids}
+    if len(ratios):
+        ratio = _weighted_median(ratios, pairs)
+        error = float(np.std(ratios) / np.sqrt(len(ratios))) if len(ratios) > 1 else 0.01
+        if abs(ratio - 1) > max(config.size_trust, 3 * error):
+            right = 1000 * ratio * float(np.median(list(given.values())))
+            raise BadInput(
+                f"the tags' size is wrong: the cameras measure {ratio:.3f} times the given one, that is {right:.2f} mm "
+                f"({int(pairs.sum())} pairs of views); wanted the side of the black square in metres: "
+                f"`--tag-size {right / 1000:.5f}`"
+            )
+        scale = ratio if error < config.size_error and pairs.sum() >= 10 else 1.0
+        sizes |= {i: scale * s for i, s in given.items()}
+        used = "measured size used" if scale != 1.0 else "given size used"
+        return sizes, [f"tag size: measured / given = {ratio:.4f} +- {error:.4f}; {used}"]
+    sizes |= given
+    unknown = sorted(body - set(sizes))
+    if unknown and not sizes.keys() & body:
+        raise BadInput(
+            "the size of the object's tags is not known, and no tag was seen by two cameras of known place at once; "
+            "give the side of the black square in metres: `--tag-size 0.05`"
+        )
+    common = float(np.median([sizes[i] for i in sorted(sizes.keys() & body)]))
+    notes = [] if given else [f"tag size measured by triangulation: {1000 * common:.2f} mm"]
+    return sizes | dict.fromkeys(unknown, common), notes
+
+
+def _weighted_median(values: Float[Array, " n"], weights: Int64[Array, " n"]) -> float:
+    order = np.argsort(values)
+    heaps = np.cumsum(weights[order])
+    return float(values[order][np.searchsorted(heaps, 0.5 * heaps[-1])])
+
+
+def _in_tagged_frame(solved: Solved, config: TruthConfig) -> Solved:
+    """The solution with the body's frame moved to `tagged` (a given layout's frame stays)."""
+    from dataclasses import replace
+
+    if config.layout is not None:
+        return solved
+    old_from_new = tagged_frame(solved.layout)
+    new_from_old = np.linalg.inv(old_from_new)
+    carry = se3.adjoint(new_from_old[None])[0]
+    tracks = {
+        toss: replace(
+            t, world_from_tagged=t.world_from_tagged @ old_from_new, covariance=carry @ t.covariance @ carry.T
+        )
+        for toss, t in solved.tracks.items()
+    }
+    center = new_from_old[:3, :3] @ solved.center_m + new_from_old[:3, 3]
+    layout = {i: new_from_old @ pose for i, pose in solved.layout.items()}
+    return replace(solved, tracks=tracks, layout=layout, center_m=center)
+
+
+def _at_color_frames(session: Session, toss: int, solved: Solved, config: TruthConfig) -> TossTruth:
+    """The track at the D455's exposures (at the mono cameras' own, where there is no D455)."""
+    track = solved.tracks[toss]
+    recorded = session.toss(toss)
+    times_ns = recorded.color().times_ns
+    if len(times_ns) == 0:
+        times_ns = track.time_ns
+    start = int(track.time_ns[0]) if len(track.time_ns) else 0
+    motion = classify((track.time_ns - start) / 1e9, track.world_from_tagged, solved.center_m, track.on_arc)
+    found = interpolate(motion, (times_ns - start) / 1e9)
+    covariance = np.full((len(times_ns), 6, 6), np.nan)
+    status: list[Literal["tracked", "interpolated", "lost"]] = []
+    for i, pose in enumerate(found.poses):
+        if not np.isfinite(pose).all():
+            status.append("lost")
+            continue
+        own = _between(track.covariance, int(found.before[i]), float(found.weight[i]))
+        own[range(3), range(3)] += found.extra_rad[i] ** 2
+        own[range(3, 6), range(3, 6)] += found.extra_m[i] ** 2
+        turn = np.kron(np.eye(2), pose[:3, :3])
+        covariance[i] = turn @ own @ turn.T
+        sigma = np.sqrt(np.diag(own))
+        good = sigma[:3].max() <= config.tracked_rad and sigma[3:].max() <= config.tracked_m
+        status.append("tracked" if good else "interpolated")
+    return TossTruth(times_ns, found.poses, covariance, tuple(status))
+
+
+def _between(covariance: Float[Array, "n 6 6"], before: int, weight: float) -> Float[Array, "6 6"]:
+    """Of a pose between two: as if what they share (cameras, layout) does not average out."""
+    a, b = covariance[max(before, 0)], covariance[min(before + 1, len(covariance) - 1)]
+    return ((1 - weight) * a + weight * b).copy()
+
+
+def fit_mesh(truth: SessionTruth, mesh_path: Path) -> Fit:
+    """Where the tags lie on a known shape. Raises BadInput where they fit nowhere."""
+    import trimesh
+
+    mesh = trimesh.load(mesh_path, force="mesh", process=False)
+    if len(mesh.vertices) == 0:
+        raise BadInput(f"{mesh_path} holds no triangles; wanted the object's surface in metres (.obj, .ply or .stl)")
+    fit = object_from_tagged_by_mesh(
+        truth.solved.layout, truth.sizes_m, np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
+    )
+    if fit.rms_m > 0.01:
+        size = 1000 * np.ptp(np.asarray(mesh.vertices), axis=0)
+        raise BadInput(
+            f"{mesh_path} does not fit the tags: they stay {1000 * fit.rms_m:.1f} mm off its surface; it measures "
+            f"{size[0]:.0f} x {size[1]:.0f} x {size[2]:.0f} mm. Wanted the tossed object's shape, in metres"
+        )
+    return fit
+
+
+def write_session_truth(
+    session: Session, truth: SessionTruth, out: Path, object_from_tagged: Transform | None, mesh_path: Path | None
+) -> dict[str, Any]:
+    """truth.json, toss_XX.mcap, mesh.obj and tags/ into the new folder `out`; returns truth.json's document."""
+    poses = {toss: _stamped(t) for toss, t in truth.tosses.items()}
+    document = truth_document(truth, object_from_tagged)
+    with tempfile.TemporaryDirectory(dir=out.parent, prefix=".truth-") as scratch:
+        folder = write_truth(Path(scratch), poses, document, _obj_bytes(mesh_path) if mesh_path is not None else None)
+        _write_layers(folder / "tags", truth)
+        folder.rename(out)
+    return document
+
+
+def replace_folder(old: Path) -> None:
+    """Remove an earlier truth/ of this command; someone else's is left alone. Raises BadInput."""
+    source = {}
+    with contextlib.suppress(OSError, ValueError):
+        source = json.loads((old / "truth.json").read_text())
+    if str(source.get("source", "")).startswith("toss-truth"):
+        shutil.rmtree(old)
+        return
+    raise BadInput(f"{old} was not made by toss-truth, so it is not replaced; move it away, or write to `--out FOLDER`")
+
+
+def _stamped(truth: TossTruth) -> list[StampedPose]:
+    return [
+        StampedPose(int(t), "world", "tagged", pose, status, cov if status != "lost" else None)
+        for t, pose, status, cov in zip(
+            truth.time_ns, truth.world_from_tagged, truth.status, truth.covariance, strict=True
+        )
+    ]
+
+
+def truth_document(truth: SessionTruth, object_from_tagged: Transform | None) -> dict[str, Any]:
+    """What truth.json says: source, accuracy, layout, cameras, residuals, verdict."""
+    solved = truth.solved
+    sigmas = np.concatenate([np.sqrt(np.einsum("nii->ni", t.covariance)) for t in truth.tosses.values()])
+    sigmas = sigmas[np.isfinite(sigmas).all(axis=1)]
+    distances = np.concatenate([np.linalg.norm(c.left_px, axis=1) for c in solved.corners])
+    return {
+        "source": "toss-truth: AprilTags in the ground-truth cameras, one factor graph over all tosses",
+        "accuracy": {
+            "position_sigma_m": float(np.sqrt((sigmas[:, 3:] ** 2).sum(axis=1).mean())) if len(sigmas) else None,
+            "rotation_sigma_rad": float(np.sqrt((sigmas[:, :3] ** 2).sum(axis=1).mean())) if len(sigmas) else None,
+            "reprojection_px": reprojection(distances),
+        },
+        **({"object_from_tagged": object_from_tagged.matrix.tolist()} if object_from_tagged is not None else {}),
+        "tags": [
+            {"id": i, "size_m": truth.sizes_m[i], "T_tagged_tag": pose.tolist()} for i, pose in solved.layout.items()
+        ],
+        "cameras": {
+            name: {
+                "world_from_camera": pose_rows(pose[None])[0],
+                "sigma_rad_m": np.sqrt(np.diag(solved.camera_covariance[name])).tolist(),
+            }
+            for name, pose in solved.cameras.items()
+        },
+        "center_of_mass_tagged_m": solved.center_m.tolist(),
+        "frames": {str(toss): _counts(t) for toss, t in truth.tosses.items()},
+        "verdict": truth.verdict.document(),
+    }
+
+
+def _counts(truth: TossTruth) -> dict[str, int]:
+    return {status: truth.status.count(status) for status in ("tracked", "interpolated", "lost")}
+
+
+def _obj_bytes(path: Path) -> bytes:
+    import trimesh
+
+    if path.suffix.lower() == ".obj":
+        return path.read_bytes()
+    mesh = trimesh.load(path, force="mesh", process=False)
+    return str(trimesh.exchange.obj.export_obj(mesh)).encode()
+
+
+def _write_layers(folder: Path, truth: SessionTruth) -> None:
+    """What toss-view draws: every tag's corners and what is left of them, the track with its covariance, cameras."""
+    folder.mkdir()
+    solved = truth.solved
+    names = sorted(solved.cameras)
+    for toss, track in solved.tracks.items():
+        mine = [c for c in solved.corners if c.toss == toss]
+        buffer = io.BytesIO()
+        np.savez(
+            buffer,
+            camera=np.array([names.index(c.camera) for c in mine], np.int64),
+            time_ns=np.array([c.time_ns for c in mine], np.int64),
+            tag_id=np.array([c.tag_id for c in mine], np.int64),
+            seen_px=np.array([c.seen_px for c in mine], np.float64).reshape(-1, 4, 2),
+            left_px=np.array([c.left_px for c in mine], np.float64).reshape(-1, 4, 2),
+            track_time_ns=track.time_ns,
+            track_world_from_tagged=track.world_from_tagged,
+            track_covariance=track.covariance,
+        )
+        (folder / f"toss_{toss:02d}.npz").write_bytes(buffer.getvalue())
+    cameras = {
+        name: {"world_from_camera": pose.tolist(), "covariance": solved.camera_covariance[name].tolist()}
+        for name, pose in solved.cameras.items()
+    }
+    write_json(folder / "cameras.json", {"names": names, "cameras": cameras})
