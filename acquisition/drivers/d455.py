@@ -65,6 +65,7 @@ class D455Camera:
         self._warnings = Warnings()
         self._counters: dict[str, parts.FrameCounter] = {}
         self._about: dict[str, Any] = {}
+        self._domains: dict[str, str] = {}
         self._unit_m = 0.001
 
     def __enter__(self) -> D455Camera:
@@ -98,6 +99,7 @@ class D455Camera:
         if self._file is None:
             set_up(self._rs, device, self._settings)
             self._about["options"] = parts.options(device.query_sensors())
+            self._about["advanced"] = parts.advanced_settings(self._rs, device)
             self._context.set_devices_changed_callback(self._on_devices)
 
     def start(self) -> None:
@@ -147,6 +149,7 @@ class D455Camera:
             "kind": "rgbd",
             "driver": f"pyrealsense2 {self._rs.__version__ if hasattr(self._rs, '__version__') else ''}".strip(),
             **self._about,
+            "time_domains": dict(self._domains),
             "settings": settings,
             "warnings": list(self._warnings.all()),
         }
@@ -312,6 +315,7 @@ class D455Camera:
     def _image(self, stream: str, frame: Any, shown: Any, host_ns: int) -> Image:
         """`frame` carries the stamps, `shown` the pixels (the same one, unless it was aligned)."""
         values = parts.metadata(self._rs, frame)
+        self._domains[stream] = str(frame.get_frame_timestamp_domain()).removeprefix("timestamp_domain.")
         exposure = parts.exposure_s(stream, values)
         counter = self._counters.setdefault(stream, parts.FrameCounter())
         return Image(
@@ -332,11 +336,10 @@ class D455Camera:
             return stamped[0]
         period_ms = 1e3 / max(1, self._about["rate_hz"])
         if not self._settings.allow_system_time:
-            domain = str(frame.get_frame_timestamp_domain()).removeprefix("timestamp_domain.")
             raise DeviceRefused(
-                f"{self.name}: {stream} images carry no metadata, so their stamps ({domain}) tell the arrival at the "
-                f"host, up to {period_ms:.0f} ms off; install librealsense's kernel patch or its libuvc backend, or "
-                "set allow_system_time = true to record all the same"
+                f"{self.name}: {stream} images carry no metadata, so their stamps ({self._domains[stream]}) tell the "
+                f"arrival at the host, up to {period_ms:.0f} ms off; install librealsense's kernel patch or its libuvc "
+                "backend, or set allow_system_time = true to record all the same"
             )
         self._warnings.add(
             f"{stream}: stamped by the host's clock on arrival; capture times are off by up to {period_ms:.0f} ms, "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Iterable, Mapping
 from typing import Any
@@ -82,6 +83,15 @@ def modes(sensors: Iterable[Any]) -> str:
                 video = profile.as_video_stream_profile()
                 found.add((profile.stream_name(), video.width(), video.height(), profile.fps()))
     return ", ".join(f"{name} {width}x{height}@{rate}" for name, width, height, rate in sorted(found))
+
+
+def advanced_settings(rs: Any, device: Any) -> dict[str, Any] | None:
+    """All settings of the depth engine as realsense-viewer saves them; None for a camera without advanced mode."""
+    try:
+        advanced = rs.rs400_advanced_mode(device)
+        return dict(json.loads(advanced.serialize_json())) if advanced.is_enabled() else None
+    except RuntimeError:
+        return None
 
 
 def preset_number(depth: Any, option: Any, name: str) -> float:

@@ -193,7 +193,9 @@ def test_a_live_camera_gets_its_settings_in_its_own_units() -> None:
 
 def test_a_recording_knows_whose_it_is(db3: Callable[..., Path]) -> None:
     with D455Camera(file=db3("plain")) as camera:
+        played(camera)
         described = camera.describe()
+    assert described["time_domains"] == {"color": "hardware_clock", "depth": "hardware_clock"}
     assert (described["model"], described["serial"]) == (SoftwareD455().name, SoftwareD455().serial)
     assert described["rate_hz"] == 30
     assert described["warnings"] == []
