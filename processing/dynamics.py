@@ -41,16 +41,17 @@ def _learn(run: Run, name: str, tracks: Mapping[int, Done], folder: Path, prior:
     from processing.contact.export import write_assets
     from processing.contact.from_tracks import learn_from_tracks
     from processing.contact.inertia import physics_of_session
-    from processing.contact.stage import session_plane
+    from processing.contact.stage import session_plane, write_rollouts
 
     world_from_camera = run.session.calibration.find("world", CAMERA)
     if world_from_camera is None:
         raise BadInput(NO_PLANE)
+    plane = session_plane(run.session)
     learned = learn_from_tracks(
         {t: read_track(d.folder, t) for t, d in tracks.items()},
         prior,
         world_from_camera,
-        session_plane(run.session),
+        plane,
         physics_of_session(run.session.start),
         run.config.contact,
         run.progress(f"{name}: contact"),
@@ -58,6 +59,7 @@ def _learn(run: Run, name: str, tracks: Mapping[int, Done], folder: Path, prior:
     write_shape(folder, learned.shape)
     write_contact(folder, learned.model)
     write_assets(folder, learned.model, learned.shape)
+    write_rollouts(folder, learned.fused, learned.rollouts, plane)
     write_json(folder / "result.json", learned.document)
     return {
         "friction": learned.model.friction,
