@@ -52,9 +52,9 @@ def track_stage(run: Run, toss: int, masks: Done) -> Done:
         )
         write_toss_track(folder, tracked)
         write_notes(folder, toss, *notes_of(tracked, run.matcher))
-        return _count(tracked.track)
+        return {**_count(tracked.track), "unfit": tracked.unfit}
 
-    return run.store.run("track", 2, run.matcher_settings(run.config.track), inputs, compute)
+    return run.store.run("track", 3, run.matcher_settings(run.config.track), inputs, compute)
 
 
 def model_stage(run: Run, model: Path) -> Done:
@@ -91,9 +91,9 @@ def model_track_stage(run: Run, toss: int, masks: Done, model: Done) -> Done:
         )
         write_toss_track(folder, tracked)
         write_notes(folder, toss, *notes_of(tracked, run.matcher))
-        return _count(tracked.track)
+        return {**_count(tracked.track), "unfit": tracked.unfit}
 
-    return run.store.run("track", 2, run.matcher_settings(run.config.track), inputs, compute)
+    return run.store.run("track", 3, run.matcher_settings(run.config.track), inputs, compute)
 
 
 def register_stage(run: Run, tracks: dict[int, Done], masks: dict[int, Done]) -> Done:
@@ -116,12 +116,15 @@ def register_stage(run: Run, tracks: dict[int, Done], masks: dict[int, Done]) ->
             )
         progress = run.progress("one object frame")
         together = register_tosses(tosses, run.config.register, progress, run.matcher, together=bool(run.starts))
-        counts = {"not_joined": [t for t, joined in zip(run.tosses, together.joined, strict=True) if not joined]}
+        counts = {
+            "not_joined": [t for t, joined in zip(run.tosses, together.joined, strict=True) if not joined],
+            "ambiguous": [t for t, unsure in zip(run.tosses, together.ambiguous, strict=True) if unsure],
+        }
         for track, joined in zip(together.tracks, together.joined, strict=True):
             write_track(folder, replace(track if joined else lost_track(track), object_frame="object"))
         return {**counts, "fit": [round(float(f), 4) if np.isfinite(f) else None for f in together.fit]}
 
-    return run.store.run("register", 1, run.matcher_settings(run.config.register), inputs, compute)
+    return run.store.run("register", 2, run.matcher_settings(run.config.register), inputs, compute)
 
 
 def field_stage(run: Run, name: str, tracks: dict[int, Done], masks: dict[int, Done]) -> Done:
