@@ -41,6 +41,7 @@ class Pass:
     masks: Mapping[int, Done]
     shared_frame: bool
     contact: Mapping[int, Done] = field(default_factory=dict)
+    rollout: Done | None = None
     notes: tuple[str, ...] = ()
     passes: tuple[Mapping[str, Any], ...] = ()
 

@@ -70,6 +70,36 @@ def _learn(run: Run, name: str, tracks: Mapping[int, Done], folder: Path, prior:
     }
 
 
+def rollout_stage(run: Run, name: str, tracks: Mapping[int, Done], shape: Done) -> Done:
+    """Stage `rollout`, the paper's Figure 4: learned on all tosses but the last, all rolled out from their release."""
+    inputs = {"shape": shape.key, **{f"track_{t:02d}": d.key for t, d in tracks.items()}}
+    inputs |= {"calibration": run.keys["calibration"], "object": run.keys["physics"]}
+
+    def compute(folder: Path) -> Counts:
+        from processing.contact.figure4 import learn_figure_4
+        from processing.contact.inertia import physics_of_session
+        from processing.contact.stage import session_plane, write_rollouts
+
+        try:
+            figure, found = learn_figure_4(
+                {t: read_track(d.folder, t) for t, d in tracks.items()},
+                read_shape(shape.folder),
+                run.session.calibration.transform("world", CAMERA),
+                session_plane(run.session),
+                physics_of_session(run.session.start),
+                run.config.contact,
+                run.progress(f"{name}: rollouts"),
+            )
+        except BadInput as why:
+            return {"kept_out": str(why)}
+        write_contact(folder, found.model)
+        write_rollouts(folder, found.fused, figure.estimated, figure.plane)
+        write_json(folder / "rollout.json", figure.to_json())
+        return {"tosses": len(figure.estimated.errors.tosses)}
+
+    return run.store.run("rollout", 1, run.config.contact, inputs, compute)
+
+
 NO_PLANE = (
     "the calibration does not say where the table is (no `world`), and contact needs the plane; run `toss-calibrate "
     "table SESSION`, or let it be estimated from depth: --table-from-depth"

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 from processing.backends import make_matcher, settings_of
 from processing.config import Config
 from processing.cycle import Pass, place_stage, run_cycle
+from processing.dynamics import rollout_stage
 from processing.frames import corrected_frames
 from processing.masks import object_masks, static_scene
 from processing.segment.static_scene import StaticScene
@@ -185,13 +186,21 @@ def _refined_rows(
 ) -> Pass:
     """The cycle on all tosses from P and O, or in scope one on every toss from p_i and O moved into its frame."""
     if scope == "all":
-        return run_cycle(run, variant, first, "all tosses")
-    ended = []
+        ended = run_cycle(run, variant, first, "all tosses")
+        return _with_rollouts(run, ended) if variant.icp and ended.contact else ended
+    parts = []
     for toss in run.tosses:
         moved = place_stage(run, toss, first.tracks[toss], once[toss], first.shapes[toss])
         alone = Pass({toss: once[toss]}, {toss: moved}, {toss: masks[toss]}, shared_frame=False)
-        ended.append(run_cycle(run, variant, alone, f"toss {toss}"))
-    return Pass.joined(ended)
+        parts.append(run_cycle(run, variant, alone, f"toss {toss}"))
+    return Pass.joined(parts)
+
+
+def _with_rollouts(run: Run, ended: Pass) -> Pass:
+    """The paper's Figure 4 on the row's last tracks and shape."""
+    done = rollout_stage(run, "all tosses", ended.tracks, next(iter(ended.shapes.values())))
+    why = done.counts.get("kept_out")
+    return replace(ended, notes=(*ended.notes, f"no rollouts: {why}")) if why else replace(ended, rollout=done)
 
 
 def _record(run: Run, variant: Variant, scope: Scope, last: Pass, masks: Mapping[int, Done]) -> VariantRecord:
@@ -212,7 +221,12 @@ def _record(run: Run, variant: Variant, scope: Scope, last: Pass, masks: Mapping
         shared_object_frame=last.shared_frame,
         session_path=os.path.relpath(run.session.path.resolve(), run.store.results.resolve()),
         notes=(f"tracker: {run.tracker}", *run.notes, *last.notes),
-        extra={"tracker": run.tracker, "contact_of_toss": contact, "passes": list(last.passes)},
+        extra={
+            "tracker": run.tracker,
+            "contact_of_toss": contact,
+            "passes": list(last.passes),
+            **({"rollout": last.rollout.name} if last.rollout is not None else {}),
+        },
     )
 
 

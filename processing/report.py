@@ -134,14 +134,14 @@ def _rollouts(results: Results, main: Row | None) -> str:
     if main is None or not stage:
         return ""
     document = json.loads((results.path / stage / "rollout.json").read_text())
-    compared = {"estimated track": document["track"]}
+    compared = {"estimated track": document["against_track"]}
     if main.score is not None and main.score.rollout is not None:
         compared["truth"] = main.score.rollout
     caption = (
-        f"The learned model, rolled out from every toss's release in steps of {1e3 * document['track']['dt_s']:.2f} "
-        f"ms. Learned on the tosses {document['learned']}; dashed: not learned on. Bands: 95 % intervals over tosses."
+        f"The learned model, rolled out from every toss's release in steps of {1e3 * document['dt_s']:.2f} "
+        f"ms. Learned on the tosses {document['learned_from']}; dashed: not learned on. Bands: 95 % intervals."
     )
-    curves = rollout_curves(compared, document["not_learned"])
+    curves = rollout_curves(compared, document["not_learned_from"])
     return f"<h2>Rollouts of the learned contact model</h2>{_picture(curves, caption)}"
 
 

@@ -61,8 +61,8 @@ def _shade(axis: Any, score: TossScore) -> None:
 
 
 def rollout_curves(evaluations: Mapping[str, Mapping[str, Any]], not_learned: Sequence[int]) -> bytes:
-    """PNG of the paper's Figure 4: rollout errors over time, mean and 95 % interval over tosses; the tosses that were
-    not learned on are dashed. `evaluations`: by what they are compared with (`track`, `truth`), as JSON."""
+    """PNG of the paper's Figure 4: rollout errors over time, mean and 95 % interval over tosses; the means of
+    tosses that were not learned on are dashed. `evaluations`: by what they are compared with (`track`, `truth`), as JSON."""
     figure = _figure(4, 2)
     axes = figure.subplots(1, 2)
     for color, (against, document) in zip(LINES, evaluations.items()):
@@ -72,10 +72,11 @@ def rollout_curves(evaluations: Mapping[str, Mapping[str, Any]], not_learned: Se
             mean, low, high = (scale * _numbers(summary[k]) for k in ("curve", "curve_low", "curve_high"))
             axis.plot(time_s, mean, color=color, lw=2, label=f"mean against the {against}")
             axis.fill_between(time_s, np.maximum(low, 0), high, color=color, alpha=0.18, lw=0)
-            for toss, curve in zip(document["tosses"], document.get(f"{name}_per_toss_curve", [])):
+            for toss, value in zip(document["tosses"], summary["per_toss"]):
                 if toss in not_learned:
-                    axis.plot(time_s, scale * _numbers(curve), color=color, lw=1, ls="--",
-                              label=f"toss {toss}, not learned on")  # fmt: skip
+                    axis.axhline(
+                        scale * value, color=color, lw=1, ls="--", label=f"mean of toss {toss}, not learned on"
+                    )
     for axis, title in zip(axes, ("position error, mm", "rotation error, deg")):
         axis.set_title(title, fontsize=9)
         axis.set_xlabel("time since release, s", fontsize=8)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -21,13 +22,14 @@ from processing.metrics import (
     chamfer,
     frame_errors,
     icp_align,
+    rollout_errors,
     surface_points,
     volume_error_percent,
 )
 from processing.phases import PHASES, Phase, frame_phases
 from processing.truth import Truth
 from recordings.errors import BadInput
-from recordings.results import Results, VariantRecord
+from recordings.results import Results, VariantRecord, read_contact
 from recordings.tracks import ObjectShape, ObjectTrack
 
 if TYPE_CHECKING:
@@ -101,7 +103,14 @@ def score_variant(results: Results, record: VariantRecord, truth: Truth) -> Vari
         values |= _with_one_alignment(tracks, truth, points, shifts[min(shifts)])
     of_shape, placed = shape_values(results, record, shifts, mesh)
     values |= {**of_shape, **contact_values(results, record, truth)}
-    return VariantScore(values, tuple(tosses), tuple(warnings), phase_values(tosses), placed)
+    rollout = rollout_scores(results, record, truth, tracks)
+    if rollout is not None:
+        n = len(rollout["tosses"])
+        values["rollout_position"] = Value(1e3 * rollout["position_m"]["mean"], "mm", n, "truth at release")
+        values["rollout_rotation"] = Value(
+            float(np.degrees(rollout["rotation_rad"]["mean"])), "deg", n, "truth at release"
+        )
+    return VariantScore(values, tuple(tosses), tuple(warnings), phase_values(tosses), placed, rollout)
 
 
 def _phases(
@@ -122,6 +131,41 @@ def phase_values(tosses: list[TossScore]) -> dict[str, dict[str, Value]]:
     labels = np.array([p for t in tosses for p in (t.phase or ["held"] * len(t.errors.add_m))])
     aligned = "each toss at its own first frame"
     return {p: pose_values(every.only(labels == p), aligned) for p in PHASES if (labels == p).any()}
+
+
+def rollout_scores(
+    results: Results, record: VariantRecord, truth: Truth, tracks: dict[int, ObjectTrack]
+) -> dict[str, Any] | None:
+    """The rows's rollouts against the truth: its poses are moved to the estimate's at the frame that is rolled out from.
+    None where nothing was rolled out or no world is known."""
+    from processing.contact.evaluate import summarise
+
+    stage, world = record.extra.get("rollout"), record.calibration.find("world", "d455")
+    if stage is None or world is None:
+        return None
+    center = read_contact(results.path / stage).center_of_mass_m
+    position, rotation, tosses = [], [], []
+    with np.load(results.path / stage / "rollouts.npz", allow_pickle=False) as stored:
+        for toss in (int(t) for t in stored["toss"]):
+            true = truth.camera_from_object(tracks[toss])
+            name = f"toss_{toss:02d}"
+            if true is None:
+                continue
+            times_s = 1e-9 * (tracks[toss].time_ns - tracks[toss].time_ns[0])
+            errors = rollout_errors(
+                stored[f"{name}.world_from_object"], stored[f"{name}.time_s"], world.matrix @ true, times_s, center
+            )
+            if errors is not None:
+                position.append(errors[0])
+                rotation.append(errors[1])
+                tosses.append(toss)
+    if not tosses:
+        return None
+    document = json.loads((results.path / stage / "rollout.json").read_text())
+    return {
+        "steps": len(position[0]), "dt_s": document["dt_s"], "tosses": tosses,
+        "position_m": summarise(np.stack(position)).to_json(), "rotation_rad": summarise(np.stack(rotation)).to_json(),
+    }  # fmt: skip
 
 
 def contact_values(results: Results, record: VariantRecord, truth: Truth) -> dict[str, Value]:

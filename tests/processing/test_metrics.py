@@ -14,7 +14,15 @@ import trimesh
 from hypothesis import given
 from hypothesis import strategies as st
 
-from processing.metrics import align_first, auc_percent, chamfer, frame_errors, icp_align, surface_points
+from processing.metrics import (
+    align_first,
+    auc_percent,
+    chamfer,
+    frame_errors,
+    icp_align,
+    rollout_errors,
+    surface_points,
+)
 from recordings.geometry import rotation_exp
 
 CORNERS_M = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * 0.05
@@ -122,3 +130,23 @@ def test_our_scores_are_those_of_the_independent_scorer(data: Callable[[str], Pa
     assert auc_percent(add) == pytest.approx(total["add_auc"], abs=0.1)
     assert auc_percent(adds) == pytest.approx(total["adds_auc"], abs=0.1)
     assert 100 * np.concatenate([e.success for e in errors]).mean() == pytest.approx(total["success"], abs=0.1)
+
+
+def test_a_rollout_that_follows_the_truth_has_no_error_and_ends_with_it() -> None:
+    true_s = np.arange(10) / 30
+    true = np.tile(np.eye(4), (10, 1, 1))
+    true[:, 0, 3], true[:, 2, 3] = 0.6 * true_s, 1.0
+    true_from_estimated = np.eye(4)
+    true_from_estimated[:3, :3] = rotation_exp(np.array([0.2, -0.4, 0.9]))
+    true_from_estimated[:3, 3] = [0.02, -0.01, 0.03]
+    rolled_s = 0.1 + np.arange(40) / 148
+    rolled = np.tile(np.eye(4), (40, 1, 1))
+    rolled[:, 0, 3], rolled[:, 2, 3] = 0.6 * rolled_s, 1.0
+    rolled = rolled @ true_from_estimated
+    found = rollout_errors(rolled, rolled_s, true, true_s, np.array([0.01, 0.0, 0.0]))
+    assert found is not None
+    reached = np.isfinite(found[0])
+    assert reached.sum() == (rolled_s[1:] <= true_s[-1] + 0.1 / 148).sum()
+    assert found[0][reached].max() < 1e-9
+    assert found[1][reached].max() < 1e-7
+    assert rollout_errors(rolled, rolled_s + 1.0, true, true_s, np.zeros(3)) is None
