@@ -62,7 +62,7 @@ def _shade(axis: Any, score: TossScore) -> None:
 
 def rollout_curves(evaluations: Mapping[str, Mapping[str, Any]], not_learned: Sequence[int]) -> bytes:
     """PNG of the paper's Figure 4: rollout errors over time, mean and 95 % interval over tosses; the means of
-    tosses that were not learned on are dashed. `evaluations`: by what they are compared with (`track`, `truth`), as JSON."""
+    tosses that were not learned on are dashed. `evaluations`: as JSON, by what they are compared with."""
     figure = _figure(4, 2)
     axes = figure.subplots(1, 2)
     for color, (against, document) in zip(LINES, evaluations.items()):
