@@ -104,7 +104,7 @@ class RobotOfSession:
         links = {name: root @ link for name, link in path.links(time_ns).items()}
         drawn = (view.draw(links).depth_m > 0).astype(np.uint8)
         tool_m = links[PANDA_TOOL].translation_m
-        if tool_m[2] > held_m:
+        if tool_m[2] > held_m and path.may_hold(time_ns):
             center = np.round(camera.project(tool_m[None])[0]).astype(int)
             cv2.circle(drawn, (int(center[0]), int(center[1])), int(camera.fx * held_m / tool_m[2]), 1, -1)
         return cv2.dilate(drawn, kernel(margin_px)) > 0

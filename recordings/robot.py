@@ -145,6 +145,11 @@ class ArmPath:
         known = np.isfinite(width)
         return float(np.interp(time_ns, times[known], width[known])) if known.any() else float("nan")
 
+    def may_hold(self, time_ns: int) -> bool:
+        """Whether the fingers are as far apart as at the start (within 3 mm), so that they may hold something."""
+        width, first = self.finger_width_m(time_ns), self.finger_width_m(int(self._states.time_ns[0]))
+        return not abs(width - first) > 0.003  # a width that nobody knows may hold something
+
     def links(self, time_ns: int, finger_width_m: float | None = None) -> dict[str, Transform]:
         """`<root>_from_<link>` of every link. A width that nobody knows counts as closed."""
         width = self.finger_width_m(time_ns) if finger_width_m is None else finger_width_m
