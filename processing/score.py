@@ -136,7 +136,8 @@ def phase_values(tosses: list[TossScore]) -> dict[str, dict[str, Value]]:
 def rollout_scores(
     results: Results, record: VariantRecord, truth: Truth, tracks: dict[int, ObjectTrack]
 ) -> dict[str, Any] | None:
-    """The row's rollouts against the truth, whose poses are moved to the estimate's where the rollout begins. None where nothing was rolled out or no world is known."""
+    """The row's rollouts against the truth, whose poses are moved to the estimate's where the rollout begins.
+    None where nothing was rolled out or no world is known."""
     from processing.contact.evaluate import summarise
 
     stage, world = record.extra.get("rollout"), record.calibration.find("world", "d455")
