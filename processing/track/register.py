@@ -124,7 +124,7 @@ def register_tosses(
     if together:
         fit[:] = 0.0
     features: dict[int, Features] = {}
-    waiting = [t for t in range(len(tosses)) if t != root]
+    waiting = [] if together else [t for t in range(len(tosses)) if t != root]
     found: dict[int, list[_Fit]] = {}
     rounds = 0
     while waiting and rounds < 2:  # a toss that does not fit now may fit when more of the object is known

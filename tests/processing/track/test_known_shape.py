@@ -140,7 +140,17 @@ def test_a_toss_is_placed_in_the_frame_of_a_known_shape(tiny_world: Any, toss: T
     alone = followed(tiny_world, toss)
     placed = register_tosses([alone], model=shape)
     assert placed.joined == (True,)
+    assert placed.ambiguous == (False,)
     assert len(placed.tracks) == 1
     errors = frame_errors(placed.tracks[0].camera_from_object, toss[2], np.eye(3) * 0.05)
     assert errors.rotation_deg.max() < 3.0
     assert errors.translation_m.max() < 0.005
+
+
+def test_a_toss_of_an_object_with_twins_is_said_to_be_ambiguous(tiny_world: Any, toss: Toss) -> None:
+    """A box without colours fits onto itself in four ways: one of them is taken, and nobody is told that it is sure."""
+    grey = [replace(f, color_rgb=np.full_like(f.color_rgb, 128)) for f in toss[0][:5]]
+    alone = followed(tiny_world, (grey, toss[1][:5]))
+    placed = register_tosses([alone], model=box_shape(np.array([0.10, 0.08, 0.06]), None))
+    assert placed.ambiguous == (True,)
+    assert placed.gap[0] < 0.02

@@ -231,6 +231,7 @@ def test_tosses_come_into_one_object_frame(tiny_world: Any, tracked: TossTrack, 
     second = followed(tiny_world, other, toss=1)
     together = register_tosses([tracked, second])
     assert together.joined == (True, True)
+    assert together.ambiguous == (False, False)
     shift = align_first(together.tracks[0].camera_from_object, toss[2])
     error = frame_errors(together.tracks[1].camera_from_object @ shift, other[2], np.eye(3) * 0.05)
     assert np.median(error.rotation_deg) < 3.0
