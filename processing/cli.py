@@ -167,7 +167,7 @@ def _vision(args: argparse.Namespace, session: Session, name: str, out: Path) ->
     else:
         for variant, scope in rows_of(name, args.scope):
             process(run, variant, scope)
-    return _evaluate(args, session, out)  # the door to truth is opened after every track and shape is written
+    return _evaluate(args, session, out, run)  # the door to truth is opened after every track and shape is written
 
 
 def _started(args: argparse.Namespace, run: Run) -> Run:
@@ -203,8 +203,9 @@ def config_of(args: argparse.Namespace) -> Config:
     return Config(given_masks=args.masks, backends=backends.chosen(args))
 
 
-def _evaluate(args: argparse.Namespace, session: Session, out: Path) -> Outcome:
+def _evaluate(args: argparse.Namespace, session: Session, out: Path, run: Run) -> Outcome:
     """Scores of all variants in the results folder, table and report."""
+    from processing.floor import coverage_floor
     from processing.report import write_report
     from processing.score import score_variant, true_mesh
     from processing.stage import locked
@@ -219,6 +220,8 @@ def _evaluate(args: argparse.Namespace, session: Session, out: Path) -> Outcome:
         truth = open_truth(args.truth, session, record.calibration)
         if truth is not None:
             scores[variant] = score_variant(results, record, truth)
+            if record.scope == "one":
+                scores[variant].values.update(coverage_floor(run, record, truth))
             mesh = true_mesh(truth)
     rows = collect(results, scores)
     with locked(out / ".table.lock"):  # of two runs on one folder, each writes a whole table

@@ -225,7 +225,7 @@ def shape_values(
     else:
         pairs = [(results.shape(record.name, "one", t), shift) for t, shift in shifts.items()]
         where = "each toss's first frame, mean over tosses"
-    scored = [_chamfers(shape, shift, truth) for shape, shift in pairs if len(shape.faces)]
+    scored = [chamfers(shape, shift, truth) for shape, shift in pairs if len(shape.faces)]
     if not scored:
         return {}, None
     placed, fitted, cleaned = ([s.placed for s in scored], [s.fitted for s in scored], [s.cleaned for s in scored])
@@ -252,7 +252,7 @@ def _first_in_frame_of(results: Results, record: VariantRecord, shifts: dict[int
 
 
 @dataclass(frozen=True, eq=False)
-class _Chamfers:
+class Chamfers:
     """Chamfer after the alignment of the poses, after a further rigid ICP (`true_from_shape`), and there of the biggest
     part alone."""
 
@@ -262,14 +262,15 @@ class _Chamfers:
     true_from_shape: Float[Array, "4 4"]
 
 
-def _chamfers(shape: ObjectShape, shift: Float[Array, "4 4"], truth: trimesh.Trimesh) -> _Chamfers:
+def chamfers(shape: ObjectShape, shift: Float[Array, "4 4"], truth: trimesh.Trimesh) -> Chamfers:
+    """Distances of a shape to the true mesh; `shift` is estimated_object_from_true_object."""
     mesh, start = _mesh(shape), np.linalg.inv(shift)
     mesh.apply_transform(start)
     placed = chamfer(mesh, truth)
     closer = icp_align(surface_points(mesh, SURFACE_POINTS), surface_points(truth, SURFACE_POINTS))
     mesh.apply_transform(closer)
     fitted, biggest = chamfer(mesh, truth), biggest_component(mesh)
-    return _Chamfers(placed, fitted, fitted if biggest is mesh else chamfer(biggest, truth), closer @ start)
+    return Chamfers(placed, fitted, fitted if biggest is mesh else chamfer(biggest, truth), closer @ start)
 
 
 def _mesh(shape: ObjectShape) -> trimesh.Trimesh:

@@ -46,6 +46,14 @@ def learn_shape(
 
     Raises BadInput where no tracked frame shows the object.
     """
+    views = chosen_views(tosses, camera, config)
+    trained = train_field(views, config.field, device, progress)
+    frame = tosses[0].track.object_frame
+    return extract_mesh(trained.field, trained.grid, frame, "neural field"), len(views)
+
+
+def chosen_views(tosses: Sequence[TossViews], camera: CameraModel, config: LearnConfig) -> list[FieldView]:
+    """Views of tracked frames, spread evenly over all tosses. Raises BadInput where none shows the object."""
     places = [(t, i) for t in tosses for i in range(len(t.track.status)) if t.track.status[i] == "tracked"]
     chosen = (
         [places[i] for i in np.unique(np.linspace(0, len(places) - 1, config.most_views).astype(int))] if places else []
@@ -53,9 +61,7 @@ def learn_shape(
     views = [view for toss, i in chosen if (view := _view(toss, i, camera)) is not None]
     if not views:
         raise BadInput("no tracked frame shows the object, so there is nothing to learn a shape from")
-    trained = train_field(views, config.field, device, progress)
-    frame = tosses[0].track.object_frame
-    return extract_mesh(trained.field, trained.grid, frame, "neural field"), len(views)
+    return views
 
 
 def _view(toss: TossViews, position: int, camera: CameraModel) -> FieldView | None:

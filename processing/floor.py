@@ -1,0 +1,65 @@
+"""The coverage floor of scope one: what one toss's frames, fused at the true poses, can show of the shape at all."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from processing.field.fuse import fuse
+from processing.field.learn import TossViews, chosen_views
+from processing.field.mesh import grid_mesh
+from processing.score import Value, chamfers, true_mesh
+from processing.stage import Counts
+from recordings.errors import BadInput
+from recordings.results import VariantRecord, read_masks, read_shape, write_shape
+from recordings.tracks import Status
+
+if TYPE_CHECKING:
+    from processing.pipeline import Run
+    from processing.truth import Truth
+
+
+def coverage_floor(run: Run, record: VariantRecord, truth: Truth) -> dict[str, Value]:
+    """`cd_floor`: mean Chamfer distance over the tosses, each toss's frames fused at its true poses. Uses the truth, so
+    it is called by the scorer only."""
+    mesh = true_mesh(truth)
+    if mesh is None:
+        return {}
+    found = []
+    for entry in (t for t in record.tosses if t.toss in run.tosses):
+        folder = _fused(run, entry.toss, run.store.results / str(entry.masks), truth)
+        if folder is not None:
+            found.append(chamfers(read_shape(folder), np.eye(4), mesh).fitted.cm)
+    if not found:
+        return {}
+    return {"cd_floor": Value(float(np.mean(found)), "cm", len(found), "each toss fused at its true poses, rigid ICP")}
+
+
+def _fused(run: Run, toss: int, masks: Path, truth: Truth) -> Path | None:
+    """Stage `floor` of one toss; None where the truth has no poses of it."""
+    from processing.truth import nowhere_track
+
+    frames = run.frames(toss)
+    track = nowhere_track(toss, run.camera.frame, frames.times_ns)
+    poses = truth.camera_from_object(track)
+    if poses is None or not np.isfinite(poses).any():
+        return None
+    status: tuple[Status, ...] = tuple("tracked" if np.isfinite(p).all() else "lost" for p in poses)
+    known = replace(track, camera_from_object=poses, status=status)
+    inputs = {f"toss_{toss:02d}": run.keys[f"toss_{toss:02d}"], "masks": masks.name,
+              "truth": hashlib.sha256(np.nan_to_num(poses).tobytes()).hexdigest()}  # fmt: skip
+
+    def compute(folder: Path) -> Counts:
+        seen = TossViews(frames, frames.depth_times_ns, read_masks(masks, toss), known)
+        views = chosen_views([seen], run.camera, run.config.shape)
+        write_shape(folder, grid_mesh(fuse(views, run.config.shape.field.fuse)))
+        return {"views": len(views), "from": "true poses: for the scores only"}
+
+    try:
+        return run.store.run("floor", 1, run.config.shape.field.fuse, inputs, compute).folder
+    except BadInput:
+        return None
