@@ -3,6 +3,10 @@ baseline side by side, on the same masks.
 
 python tools/bench_vision.py                                       # cube_dev, own masks, both trackers
 python tools/bench_vision.py --masks true --trackers ours DIR...   # sessions in the folder layout, truth in DIR_truth
+python tools/bench_vision.py --trackers ours --shape DIR...        # the learned shape too, beside its floor: true poses
+
+A frame is wrong where its rotation is off by more than 5 degrees; silent where it is wrong, marked as tracked, and its
+covariance does not say so (beyond three standard deviations). Calibrated covariances have a normalised error near 1.
 
 One thread; CPU time, not wall time. Compiling the kernels (once a machine) is not counted.
 """
@@ -16,7 +20,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -25,17 +29,20 @@ import cv2
 import numpy as np
 import trimesh
 
-from processing.metrics import FrameErrors, align_first, auc_percent, frame_errors, surface_points
-from processing.segment.background import BackgroundSegmenter, BackgroundSettings
+from processing.field.learn import LearnConfig, TossViews, learn_shape
+from processing.metrics import FrameErrors, align_first, auc_percent, chamfer, frame_errors, icp_align, surface_points
+from processing.segment.background import BackgroundSegmenter
+from processing.segment.follow import BackgroundSettings
 from processing.segment.segmenter import Example
 from processing.segment.static_scene import SceneSettings, calibrated_table_depth, learn_scene, sample_positions
 from processing.track.frame_to_model import FrameToModel
 from processing.track.register import register_tosses
 from processing.track.sequence import TossTrack, track_toss
+from recordings.geometry import rotation_log
 from recordings.importers.folder import import_folder
 from recordings.progress import Silent
 from recordings.session import Session
-from recordings.tracks import ObjectTrack
+from recordings.tracks import ObjectTrack, Status
 
 CAMERA = "d455"
 DATA = Path(os.environ.get("TOSSLAB_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
@@ -59,6 +66,7 @@ def main() -> int:
     parser.add_argument("--masks", choices=("own", "true"), default="own")
     parser.add_argument("--trackers", default="ours,frame-to-model", help="comma separated")
     parser.add_argument("--tosses", type=int, help="the first N tosses only")
+    parser.add_argument("--shape", action="store_true", help="learn the shape too (ours)")
     given = parser.parse_args()
     cv2.setNumThreads(1)
     with tempfile.TemporaryDirectory() as place:
@@ -67,7 +75,7 @@ def main() -> int:
             session = Session.open(Path(place) / folder.name)
             seen = look(session, folder, given.masks, given.tosses)
             for tracker in given.trackers.split(","):
-                bench(session, folder, seen, tracker)
+                bench(session, folder, seen, tracker, given.shape)
     print(f"peak memory {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6:.2f} GB")
     return 0
 
@@ -90,7 +98,7 @@ def truth_of(folder: Path) -> Path:
 
 def true_masks(folder: Path, number: int) -> tuple[Masks, np.ndarray]:
     files = sorted((truth_of(folder) / f"toss_{number:02d}" / "masks").glob("*.png"))
-    masks = [cv2.imread(str(f), cv2.IMREAD_GRAYSCALE) > 0 for f in files]
+    masks = [np.asarray(np.asarray(cv2.imread(str(f), cv2.IMREAD_GRAYSCALE)) > 0) for f in files]
     return masks, np.ones(len(masks))
 
 
@@ -120,7 +128,7 @@ def _example(session: Session, numbers: Sequence[int]) -> Example:
     return Example(session.toss(number).rgbd(CAMERA)[position], mask)
 
 
-def bench(session: Session, folder: Path, seen: list[Seen], tracker: str) -> None:
+def bench(session: Session, folder: Path, seen: list[Seen], tracker: str, shape: bool) -> None:
     """Track every toss, register ours, print a line a toss and the totals."""
     points = surface_points(trimesh.load(truth_of(folder) / "mesh.obj", force="mesh", process=False), 2000)
     run: Callable[[Session, Seen], TossTrack | ObjectTrack] = ours if tracker == "ours" else baseline
@@ -135,7 +143,8 @@ def bench(session: Session, folder: Path, seen: list[Seen], tracker: str) -> Non
         full.append(found)
         errors.append(judged(track.camera_from_object, toss.truth, None, points))
         lost = int(track.lost.sum())
-        print(f"  {folder.name} toss {toss.number} {tracker}: {line(errors[-1], toss.moving)} lost {lost}")
+        marks = f"lost {lost} interpolated {track.status.count('interpolated')} {honesty(track, toss.truth)}"
+        print(f"  {folder.name} toss {toss.number} {tracker}: {line(errors[-1], toss.moving)} {marks}", flush=True)
     moving = np.concatenate([t.moving for t in seen])
     print(f"{folder.name} {tracker}: {line(joined(errors), moving)}, {1000 * cpu_s / frames:.0f} CPU-ms a frame")
     tracks = [f for f in full if isinstance(f, TossTrack)]
@@ -146,8 +155,57 @@ def bench(session: Session, folder: Path, seen: list[Seen], tracker: str) -> Non
         shift = align_first(together.tracks[0].camera_from_object, seen[0].truth)
         errors = [judged(r.camera_from_object, t.truth, shift, points) for r, t in zip(together.tracks, seen)]
         left = [t.track.toss for t, ok in zip(tracks, together.joined) if not ok]
+        unsure = [t.track.toss for t, twin in zip(tracks, together.ambiguous) if twin]
         print(f"{folder.name} {tracker}, one alignment for all: {line(joined(errors), moving)}, left out {left}, "
-              f"{1000 * cpu_s / frames:.0f} CPU-ms a frame more")  # fmt: skip
+              f"ambiguous {unsure}, {1000 * cpu_s / frames:.0f} CPU-ms a frame more", flush=True)  # fmt: skip
+        if shape:
+            kept = [i for i, ok in enumerate(together.joined) if ok]
+            own = [together.tracks[i] for i in kept]
+            learned(session, folder, [seen[i] for i in kept], own, "learned")
+            true = [replace(t, camera_from_object=seen[i].truth, status=status_of(seen[i].truth))
+                    for i, t in zip(kept, own)]  # fmt: skip
+            learned(session, folder, [seen[i] for i in kept], true, "at true poses (floor)")
+
+
+def status_of(poses: np.ndarray) -> tuple[Status, ...]:
+    return tuple("tracked" if np.isfinite(p).all() else "lost" for p in poses)
+
+
+def learned(session: Session, folder: Path, seen: list[Seen], tracks: Sequence[ObjectTrack], label: str) -> None:
+    """The shape from these tracks: Chamfer distance after a rigid ICP, CPU seconds."""
+    start = time.process_time()
+    views = []
+    for toss, track in zip(seen, tracks):
+        frames = session.toss(toss.number).rgbd(CAMERA)
+        views.append(TossViews(frames, frames.depth_times_ns, toss.masks, track))
+    shape, used = learn_shape(views, session.calibration.camera(CAMERA), LearnConfig(), "cpu", Silent())
+    cpu_s = time.process_time() - start
+    truth = trimesh.load(truth_of(folder) / "mesh.obj", force="mesh", process=False)
+    mesh = trimesh.Trimesh(shape.vertices_m, shape.faces, process=False)
+    # from first-frame alignment, because a closest-point search alone would not find a turn of 90 degrees
+    shift = align_first(tracks[0].camera_from_object, seen[0].truth)
+    mesh.apply_transform(np.eye(4) if shift is None else np.linalg.inv(shift))
+    mesh.apply_transform(icp_align(surface_points(mesh, 6000), surface_points(truth, 30000)))
+    print(
+        f"{folder.name} shape {label}: CD {chamfer(mesh, truth).cm:.3f} cm, {used} views, {cpu_s:.1f} CPU-s", flush=True
+    )
+
+
+def honesty(track: ObjectTrack, truth: np.ndarray) -> str:
+    """Wrong frames, silent ones among them, and the median normalised squared error of the rotation."""
+    shift = align_first(track.camera_from_object, truth)
+    wrong, silent, normalised = 0, 0, []
+    for i, (e, t) in enumerate(zip(track.camera_from_object @ (np.eye(4) if shift is None else shift), truth)):
+        sigma = track.covariance[i, :3, :3]
+        if track.status[i] == "lost" or not np.isfinite(e).all() or not np.isfinite(sigma).all() or not sigma.any():
+            continue
+        turn = rotation_log(t[:3, :3] @ e[:3, :3].T)
+        squared = float(turn @ np.linalg.solve(sigma + 1e-12 * np.eye(3), turn)) / 3
+        off = bool(np.degrees(np.linalg.norm(turn)) > 5)
+        wrong += off
+        silent += off and track.status[i] == "tracked" and squared > 9
+        normalised.append(squared)
+    return f"wrong {wrong} silent {silent} normalised {np.median(normalised) if normalised else np.nan:.1f}"
 
 
 def ours(session: Session, toss: Seen) -> TossTrack:
