@@ -48,8 +48,8 @@ def _parser() -> Any:
     parser.add_argument("--toss", metavar="I[-J]", help="only these tosses (default: all with mono images)")
     parser.add_argument("--mesh", type=Path, metavar="FILE", help="the object's known shape, metres: goes into truth/, "
                         "and the tags are laid on it")  # fmt: skip
-    parser.add_argument("--object-from-tagged", type=Path, metavar="FILE", help="JSON with the 4x4 from the tags' "
-                        "body frame to the object's (the mesh's); with --mesh it is found where this is not given")  # fmt: skip
+    parser.add_argument("--object-from-tagged", type=Path, metavar="FILE", help="JSON with the 4x4 from the tags' body "
+                        "to the object's (the mesh's) frame; with --mesh it is found if left out")  # fmt: skip
     parser.add_argument("--out", type=Path, metavar="FOLDER", help="write here (default: SESSION/truth)")
     parser.add_argument("--replace", action="store_true", help="an earlier truth/ of this command may be replaced")
     parser.set_defaults(work=_work)

@@ -5,9 +5,9 @@ The measured poses are world_from_body at times t_k; `center` is the centre of m
 - `ballistic`: the centre of mass takes the parabola through both ends, x(t) = chord - g (t - t_k)(t_k+1 - t) / 2, and
   the body turns at constant speed. Nothing but the two ends is needed.
 - `smooth`: a cubic through both ends with the slopes of its neighbours.
-- `impact`: the motion before is carried on and the motion after carried back; where they come nearest to each other in
-  the interval is the impact, and each holds on its own side. What is left of a gap between them is shared out linearly.
-  Where they do not meet (a second impact, a contact that lasts) it is bridged by a cubic as well.
+- `impact`: the motion before is carried on and the motion after carried back; where they meet in the interval is the
+  impact, and each holds on its own side. What is left of a gap between them is shared out linearly. Where they do not
+  meet (a second impact, a contact that lasts) it is bridged by a cubic as well.
 """
 
 from __future__ import annotations
@@ -31,10 +31,8 @@ class InterpolationConfig:
     jolt_rad: float = 0.012
     longest_gap: float = 1.6
     """An interval longer than this many usual ones is a gap: what lies in it is uncertain."""
-    arm_m: float = 0.06
-    """A turn counts as much as the way of a point this far from the centre."""
-    meet_m: float = 0.0015
-    """Motions before and after an impact meet when they come as near as this."""
+    meet_share: float = 0.25
+    """Motions before and after an impact meet when they come nearer than this share of what parts them elsewhere."""
     impact_steps: int = 40
     """Instants of an interval at which an impact is tried."""
     reach: float = 0.6
@@ -211,27 +209,54 @@ def _hermite(u: float, h: float, a: Array, b: Array, slope_a: Array, slope_b: Ar
 def _through_impact(
     motion: Motion, k: int, t: float, config: InterpolationConfig
 ) -> tuple[Float[Array, "4 4"], float, float]:
+    """Way and turn each for itself: where the motions before and after meet, along them; else on the cubic."""
+    if k == 0 or k + 1 >= len(motion.kinds):
+        return _bridged(motion, k, t, 1 if k == 0 else k - 1)
     a, b = float(motion.time_s[k]), float(motion.time_s[k + 1])
-    left = k - 1 if k > 0 and motion.kinds[k - 1] != "impact" else None
-    right = k + 1 if k + 1 < len(motion.kinds) and motion.kinds[k + 1] != "impact" else None
-    if left is None or right is None:
-        return _bridged(motion, k, t, left if left is not None else right)
     tried = np.linspace(a, b, config.impact_steps)
-    gaps = [_gap(_carried(motion, left, s), _carried(motion, right, s), config) for s in tried]
-    best = int(np.argmin([g[2] for g in gaps]))
-    impact, (gap_m, gap_rad, gap) = float(tried[best]), gaps[best]
-    if gap > config.meet_m:
-        return _bridged(motion, k, t, left)
-    share_before = (impact - a) / (b - a)
-    before, after = _carried(motion, left, impact), _carried(motion, right, impact)
+    before = np.array([_carried(motion, k - 1, s) for s in tried])
+    after = np.array([_carried(motion, k + 1, s) for s in tried])
+    x_before, x_after = (p[:, :3, 3] + p[:, :3, :3] @ motion.center_m for p in (before, after))
+    ways = x_after - x_before
+    turns = Rotation.from_matrix(np.swapaxes(before[:, :3, :3], -1, -2) @ after[:, :3, :3]).as_rotvec()
+    pose, loose_m, loose_rad = _bridged(motion, k, t, k - 1)
+    x, R = pose[:3, 3] + pose[:3, :3] @ motion.center_m, pose[:3, :3]
+    alone = motion.kinds[k - 1] == "ballistic" and motion.kinds[k + 1] != "impact"
+    met = _meeting(tried, ways, t, config) if alone else None  # in contact a way curves, and would meet anywhere
+    if met is not None:
+        at = _carried(motion, k - 1 if met.early else k + 1, t)
+        x, loose_m = at[:3, 3] + at[:3, :3] @ motion.center_m + met.correction, met.loose
+    met = _meeting(tried, turns, t, config)
+    if met is not None:
+        at = _carried(motion, k - 1 if met.early else k + 1, t)
+        R, loose_rad = at[:3, :3] @ Rotation.from_rotvec(met.correction).as_matrix(), met.loose
+    return _pose(motion, R, x), loose_m, loose_rad
+
+
+@dataclass(frozen=True, eq=False)
+class _Meeting:
+    """`early`: the time is before the impact. `correction`: the share of the gap that this time has to make up."""
+
+    early: bool
+    correction: Float[Array, "3"]
+    loose: float
+
+
+def _meeting(
+    tried: Float[Array, " s"], gaps: Float[Array, "s 3"], t: float, config: InterpolationConfig
+) -> _Meeting | None:
+    """The instant at which two motions are nearest, if that is near against what parts them at the interval's ends."""
+    apart = np.linalg.norm(gaps, axis=1)
+    best = int(np.argmin(apart))
+    if apart[best] > config.meet_share * max(apart[0], apart[-1]):
+        return None
+    a, b, impact = float(tried[0]), float(tried[-1]), float(tried[best])
+    share = (impact - a) / (b - a)
     if t < impact:
-        pose = _moved_towards(motion, _carried(motion, left, t), before, after, share_before * (t - a) / (impact - a))
-        loose = (t - a) / (impact - a)
-    else:
-        back = (1 - share_before) * (b - t) / max(b - impact, 1e-9)
-        pose = _moved_towards(motion, _carried(motion, right, t), after, before, back)
-        loose = (b - t) / max(b - impact, 1e-9)
-    return pose, 0.5 * gap_m * loose, 0.5 * gap_rad * loose
+        along = (t - a) / (impact - a)
+        return _Meeting(True, share * along * gaps[best], 0.5 * float(apart[best]) * along)
+    along = (b - t) / max(b - impact, 1e-9)
+    return _Meeting(False, -(1 - share) * along * gaps[best], 0.5 * float(apart[best]) * along)
 
 
 def _bridged(motion: Motion, k: int, t: float, clean: int | None) -> tuple[Float[Array, "4 4"], float, float]:
@@ -255,25 +280,6 @@ def _line(motion: Motion, k: int, t: float) -> Float[Array, "4 4"]:
     turn = _turns(motion.poses[k : k + 2])[0]
     x = (1 - u) * _center(motion, k) + u * _center(motion, k + 1)
     return _pose(motion, motion.poses[k, :3, :3] @ Rotation.from_rotvec(u * turn).as_matrix(), x)
-
-
-def _gap(a: Float[Array, "4 4"], b: Float[Array, "4 4"], config: InterpolationConfig) -> tuple[float, float, float]:
-    """Metres, radians and both together between two poses."""
-    turn = float(Rotation.from_matrix(a[:3, :3].T @ b[:3, :3]).magnitude())
-    way = float(np.linalg.norm(a[:3, 3] - b[:3, 3]))
-    return way, turn, float(np.hypot(way, config.arm_m * turn))
-
-
-def _moved_towards(
-    motion: Motion, pose: Float[Array, "4 4"], here: Float[Array, "4 4"], there: Float[Array, "4 4"], share: float
-) -> Float[Array, "4 4"]:
-    """`pose` with this share of the motion from `here` to `there`: rotations and centres apart."""
-    R = (
-        pose[:3, :3]
-        @ Rotation.from_rotvec(share * Rotation.from_matrix(here[:3, :3].T @ there[:3, :3]).as_rotvec()).as_matrix()
-    )
-    ends = [p[:3, 3] + p[:3, :3] @ motion.center_m for p in (pose, here, there)]
-    return _pose(motion, R, ends[0] + share * (ends[2] - ends[1]))
 
 
 def _bend(motion: Motion, k: int, clean: int | None) -> tuple[float, float]:

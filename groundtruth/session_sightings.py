@@ -223,22 +223,59 @@ def shared_times(sightings: Sightings, within_ns: int) -> tuple[Sightings, int]:
     return replace(sightings, seen=seen, frames=frames), spread
 
 
-def measured_sizes_m(
-    sightings: Sightings, calibration: RigCalibration, ids: frozenset[int]
-) -> dict[int, tuple[float, int]]:
-    """Side of each tag by triangulation between cameras whose places are known: median edge and number of pairs."""
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """One tag at one instant, triangulated between cameras of known place: its mean edge, and that in the images."""
+
+    tag_id: int
+    edge_m: float
+    edge_px: float
+
+
+def triangulated_tags(sightings: Sightings, calibration: RigCalibration) -> list[Measured]:
+    """Every tag that two or more cameras of known place saw at an instant."""
     groups: dict[tuple[int, int, int], list[TagSeen]] = defaultdict(list)
     for s in sightings.seen:
-        if s.tag.tag_id in ids:
-            groups[(s.toss, s.time_ns, s.tag.tag_id)].append(s)
-    edges: dict[int, list[float]] = defaultdict(list)
+        groups[(s.toss, s.time_ns, s.tag.tag_id)].append(s)
+    found = []
     for (*_, tag_id), group in groups.items():
-        rays = [_world_rays(calibration, s) for s in group]
-        known = [r for r in rays if r is not None]
-        if len(known) >= 2:
-            corners = _triangulated(known)
-            edges[tag_id].append(float(np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1).mean()))
+        rays = [r for r in (_world_rays(calibration, s) for s in group) if r is not None]
+        if len(rays) >= 2:
+            edge_px = float(np.mean([_edge(s.tag.corners_px) for s in group]))
+            found.append(Measured(tag_id, _edge(_triangulated(rays)), edge_px))
+    return found
+
+
+def _edge(corners: Float[Array, "4 d"]) -> float:
+    return float(np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1).mean())
+
+
+def measured_sizes_m(measured: Sequence[Measured], ids: frozenset[int]) -> dict[int, tuple[float, int]]:
+    """Side of each tag and from how many instants."""
+    edges: dict[int, list[float]] = defaultdict(list)
+    for m in measured:
+        if m.tag_id in ids:
+            edges[m.tag_id].append(m.edge_m)
     return {i: (float(np.median(e)), len(e)) for i, e in edges.items()}
+
+
+def shrink_px(measured: Sequence[Measured], sizes_m: Mapping[int, float], least: int = 10) -> float:
+    """By how many pixels every tag's edge is too short in the images: light spills over dark squares, and blur rounds
+    corners. The median over tags of known size; 0 where there are too few, or it is no such effect (above 1 px)."""
+    short = [m.edge_px * (1 - m.edge_m / sizes_m[m.tag_id]) for m in measured if m.tag_id in sizes_m]
+    value = float(np.median(short)) if len(short) >= least else 0.0
+    return value if abs(value) < 1.0 else 0.0
+
+
+def grown(sightings: Sightings, by_px: float) -> Sightings:
+    """All tags' edges lengthened by this many pixels about their middles."""
+
+    def larger(s: TagSeen) -> TagSeen:
+        corners = s.tag.corners_px
+        middle = corners.mean(axis=0)
+        return replace(s, tag=replace(s.tag, corners_px=middle + (corners - middle) * (1 + by_px / _edge(corners))))
+
+    return replace(sightings, seen=tuple(larger(s) for s in sightings.seen))
 
 
 def _world_rays(calibration: RigCalibration, s: TagSeen) -> tuple[Float[Array, "3"], Float[Array, "4 3"]] | None:

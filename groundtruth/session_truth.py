@@ -20,7 +20,15 @@ from groundtruth import se3
 from groundtruth.answer import pose_rows, reprojection
 from groundtruth.interpolate import classify, interpolate
 from groundtruth.offset import Fit, object_from_tagged_by_mesh, tagged_frame
-from groundtruth.session_sightings import assign_roles, find_tags, measured_sizes_m, shared_times
+from groundtruth.session_sightings import (
+    assign_roles,
+    find_tags,
+    grown,
+    measured_sizes_m,
+    shared_times,
+    shrink_px,
+    triangulated_tags,
+)
 from groundtruth.session_solve import Solved, solve_session
 from groundtruth.verdict import Verdict, judge
 from recordings.errors import BadInput
@@ -44,10 +52,8 @@ class TruthConfig:
     layout_sizes_m: Mapping[int, float] | None = None
     sync_s: float = 0.0005
     """Images of different cameras nearer than this are one instant."""
-    size_trust: float = 0.01
-    """A given tag size may be wrong by this share; within it the measured one is taken."""
-    size_error: float = 0.0015
-    """The measured size is used when it is known better than this share (standard error)."""
+    size_trust: float = 0.015
+    """A given tag size may differ from the measured one by this share: corners of small tags lie a little inside."""
     tracked_m: float = 0.0015
     tracked_rad: float = 0.01
     """A pose is `tracked` when its standard deviations are below these, else `interpolated`."""
@@ -82,8 +88,14 @@ def find_truth(
         calibration.camera(camera)
     sightings, spread_ns = shared_times(sightings, round(config.sync_s * 1e9))
     roles = assign_roles(sightings, calibration, config.ignored, config.layout)
-    measured = measured_sizes_m(sightings, calibration, roles.body | roles.still)
+    triangulated = triangulated_tags(sightings, calibration)
+    measured = measured_sizes_m(triangulated, roles.body | roles.still)
     sizes, size_notes = _sizes(config, roles.body | roles.still, roles.body, measured)
+    known = {t.tag_id: t.size_m for t in calibration.table_tags if t.tag_id in roles.table}
+    known |= {i: s for i, s in sizes.items() if i in _given(config, roles.body)}
+    short_px = shrink_px(triangulated, known)
+    sightings = grown(sightings, short_px)
+    size_notes += [f"tags' edges appear {short_px:.2f} px short; corners moved outwards by that"] if short_px else []
     solved = _in_tagged_frame(
         solve_session(sightings, roles, sizes, calibration, config.layout, progress=progress), config
     )
@@ -104,9 +116,7 @@ def _sizes(
     config: TruthConfig, ids: frozenset[int], body: frozenset[int], measured: Mapping[int, tuple[float, int]]
 ) -> tuple[dict[int, float], list[str]]:
     """Each tag's side, and notes. A given size is checked against what the cameras measure; their ratio is common."""
-    given = {i: s for i, s in (config.layout_sizes_m or {}).items() if i in body}
-    if config.tag_size_m is not None:
-        given |= dict.fromkeys(body - set(given), config.tag_size_m)
+    given = _given(config, body)
     ratios = np.array([measured[i][0] / given[i] for i in sorted(given) if i in measured])
     pairs = np.array([measured[i][1] for i in sorted(given) if i in measured])
     sizes = {i: m for i, (m, _) in measured.items() if i in ids}
@@ -120,10 +130,8 @@ def _sizes(
                 f"({int(pairs.sum())} pairs of views); wanted the side of the black square in metres: "
                 f"`--tag-size {right / 1000:.5f}`"
             )
-        scale = ratio if error < config.size_error and pairs.sum() >= 10 else 1.0
-        sizes |= {i: scale * s for i, s in given.items()}
-        used = "measured size used" if scale != 1.0 else "given size used"
-        return sizes, [f"tag size: measured / given = {ratio:.4f} +- {error:.4f}; {used}"]
+        note = f"tag size: measured / given = {ratio:.4f} +- {error:.4f} ({int(pairs.sum())} pairs of views)"
+        return sizes | given, [note]
     sizes |= given
     unknown = sorted(body - set(sizes))
     if unknown and not sizes.keys() & body:
@@ -134,6 +142,11 @@ def _sizes(
     common = float(np.median([sizes[i] for i in sorted(sizes.keys() & body)]))
     notes = [] if given else [f"tag size measured by triangulation: {1000 * common:.2f} mm"]
     return sizes | dict.fromkeys(unknown, common), notes
+
+
+def _given(config: TruthConfig, body: frozenset[int]) -> dict[int, float]:
+    given = {i: s for i, s in (config.layout_sizes_m or {}).items() if i in body}
+    return given | (dict.fromkeys(body - set(given), config.tag_size_m) if config.tag_size_m is not None else {})
 
 
 def _weighted_median(values: Float[Array, " n"], weights: Int64[Array, " n"]) -> float:
