@@ -97,6 +97,9 @@ class ArmThrower:
         self.delay = estimate_delay(delays) or self.delay
         return self.delay
 
+    def over(self) -> bool:
+        return False
+
     def learn(self, delay_s: float) -> None:
         """The delay of a toss, from its data: each one makes the next plan better."""
         self._measured.append(delay_s)

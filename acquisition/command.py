@@ -18,7 +18,7 @@ from typing import Any
 from acquisition.clock import SessionClock
 from acquisition.interrupts import Interrupts
 from acquisition.operator import Keyboard, Nobody, Operator, single_keys
-from acquisition.preflight import Preflight, preflight
+from acquisition.preflight import Preflight, of_recording, preflight
 from acquisition.recorder import Recorder
 from acquisition.rig import Rig
 from acquisition.run import Options, SessionReport, SessionRun
@@ -67,8 +67,11 @@ def _record(
         open_things.enter_context(recorder)
         if args.preview:
             open_things.enter_context(_preview(recorder))
-        time.sleep(WARM_UP_S)
-        checks = preflight(recorder, setup.calibration, out)
+        if setup.live:
+            time.sleep(WARM_UP_S)
+            checks = preflight(recorder, setup.calibration, out)
+        else:
+            checks = of_recording(recorder, setup.calibration, out)
         operator.say(checks.text())
         _go_on(checks, operator)
         thrower = make_thrower(setup, recorder, operator)

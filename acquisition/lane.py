@@ -63,6 +63,7 @@ class Lane:
         self.keep_all = False
         self._queue: BoundedQueue[Item] = BoundedQueue(max(int(queue_s * rate_hz), 4))
         self._ring: deque[Item] = deque()
+        self._left_ns = 0
         self._ring_ns, self._hold_ns = round(ring_s * 1e9), round(hold_s * 1e9)
         self._write = write
         self._thread = threading.Thread(target=self._run, name=f"lane {topic}", daemon=True)
@@ -95,7 +96,10 @@ class Lane:
             got = self._queue.take(WAIT_S)
             if isinstance(got, threading.Event):
                 self._flush(self.take, everything=True)
+                self._leave()
                 got.set()
+            elif got is not None and got.host_ns <= self._left_ns:
+                self.counter.dropped("too late", got.count)
             elif got is not None:
                 self._ring.append(got)
                 self._flush(self.take)
@@ -103,6 +107,12 @@ class Lane:
                 self._flush(self.take)
         while self._ring:
             self.counter.idle(self._ring.popleft().count)
+
+    def _leave(self) -> None:
+        """Nothing more goes into the take that ends: its writer is about to be somebody else's."""
+        if self.take is not None and self.take.end_host_ns is not None:
+            self._left_ns = self.take.end_host_ns
+            self.take = None
 
     def _flush(self, take: Take | None, everything: bool = False) -> None:
         now_ns = time.monotonic_ns()

@@ -85,6 +85,12 @@ def preflight(recorder: Recorder, calibration: RigCalibration, folder: Path, sec
     return Preflight(tuple(rows))
 
 
+def of_recording(recorder: Recorder, calibration: RigCalibration, folder: Path) -> Preflight:
+    """What can be asked of a recording before it is played."""
+    age = calibration_age(calibration, float("inf"), time.time())
+    return Preflight((*devices(recorder), *age, disk(recorder, folder)))
+
+
 def _watch(recorder: Recorder, seconds: float) -> dict[str, list[float]]:
     """The mean grey of each stream's pictures, frame by frame."""
     seen: dict[str, list[float]] = {}

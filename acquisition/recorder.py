@@ -151,8 +151,6 @@ class Recorder:
             take.marks = [lane.mark() for lane in self.lanes.values()]
         if not all(mark.is_set() for mark in take.marks):
             return False
-        for lane in self.lanes.values():
-            lane.take = None
         self._take = None
         return True
 

@@ -32,6 +32,7 @@ from recordings.tracks import RigCalibration
 
 POLL_S = 0.02
 SLOW_S = 2.0
+PLAYED = "end of the recording"
 STOPS_SESSION = ("user_stopped",)
 ENDS_TAKE = ("lost", "silent", "reflex", "user_stopped", "error", "disk", "fault", "motion")
 
@@ -141,7 +142,8 @@ class SessionRun:
             events = take.watcher.events()
             troubles = take.troubles + self.recorder.troubles()
             counts = self._counts(before)
-            verdict = judge(counts, troubles, events, self.config, fixed_s is None, take.write_failure)
+            expects_toss = fixed_s is None and ended_by != PLAYED
+            verdict = judge(counts, troubles, events, self.config, expects_toss, take.write_failure)
             decision: str = self.operator.decide(verdict)
         except BaseException:
             with self.interrupts.shield():
@@ -299,6 +301,9 @@ class _Running:
             time.sleep(POLL_S)
             now_s = time.monotonic()
             self.seconds = now_s - self.began_s
+            if run.thrower.over():
+                self._look()
+                return PLAYED
             why = self._trouble() or self._key() or self._disk()
             if why:
                 self.halt()

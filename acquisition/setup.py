@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -38,7 +38,8 @@ class Setup:
     thrower: Thrower
     calibration: RigCalibration
     lab: SyntheticLab | None = None
-    notes: list[str] = field(default_factory=list)
+    live: bool = True
+    """False: a recording, which has nothing to say before it is played."""
 
 
 def set_up(name: str) -> Setup:

@@ -22,6 +22,9 @@ class Thrower(Protocol):
     def prepare(self, toss: int, attempt: int, progress: Progress) -> TossPlan | None:
         """Bring arm and object to the start of the next toss. None: somebody tosses by hand."""
 
+    def over(self) -> bool:
+        """Nothing more will come of this toss (a recording has been played to its end)."""
+
     def learn(self, delay_s: float) -> None:
         """The release delay of a toss, from its data."""
 
@@ -31,6 +34,9 @@ class ByHand:
 
     def prepare(self, toss: int, attempt: int, progress: Progress) -> TossPlan | None:
         return None
+
+    def over(self) -> bool:
+        return False
 
     def learn(self, delay_s: float) -> None:
         pass

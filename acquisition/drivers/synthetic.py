@@ -18,7 +18,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 from numpy import ndarray as Array
 
 from acquisition.devices import (
@@ -43,8 +43,8 @@ from recordings.errors import BadInput
 from recordings.geometry import CameraModel, Transform
 from recordings.progress import Progress
 
-BUFFER_FRAMES = 16
-"""What a camera's driver holds for a slow reader; older frames are thrown away and counted."""
+QUIET_NS = 10_000_000
+"""How often a camera that says nothing looks whether it may speak again."""
 ARM_NOISE = (2e-5, 1.5e-3)
 WIDTH_NOISE_M = 2e-5
 STREAM_SEEDS = {"d455/color": 1, "d455/depth": 2, "mono0": 3, "mono1": 4, "mono2": 5, "arm": 6, "gripper": 7}
@@ -90,6 +90,8 @@ class SyntheticConfig:
     """Mean of what comes on top (exponential)."""
     depth_delay_ms: float = 0.0
     dropped_share: float = 0.0
+    buffer_frames: int = 16
+    """What a camera's driver holds for a slow reader; older frames are thrown away and counted."""
     wrap_after_s: float = 8.0
     """When the RGBD camera's 32-bit microseconds start over (negative: never in a session)."""
     gripper_delay_ms: float = 60.0
@@ -258,12 +260,13 @@ class _Camera(_Device):
         if not self._ready(timeout_s):
             return None
         while True:
+            quiet = self._faults.active("silence") or self._faults.active("lost_trigger")
             self._skip_lost()
-            due_ns = self._arrival_ns(self._frame)
-            if self._faults.active("silence") or self._faults.active("lost_trigger"):
-                due_ns = ends_ns + 1
+            due_ns = min(self._arrival_ns(self._frame), time.monotonic_ns() + QUIET_NS if quiet else 1 << 62)
             if not self._wait_until(due_ns, max((ends_ns - time.monotonic_ns()) / 1e9, 0.0)):
                 return None
+            if quiet:
+                continue
             self._frame += 1
             if self._faults.active("unplug") is not None:
                 raise DeviceLost(f"{self.name} was unplugged (simulated)")
@@ -277,7 +280,7 @@ class _Camera(_Device):
         if quiet and newest > self._frame:
             self._missed_triggers += newest - self._frame if self._faults.active("lost_trigger") else 0
             self._frame = newest
-        behind = newest - self._frame - BUFFER_FRAMES
+        behind = newest - self._frame - config.buffer_frames
         if behind > 0:
             self._frame += behind
             for stream in self._streams:
@@ -451,15 +454,21 @@ class _ArmBody:
                 return Motion("done", "", ticks, 0, self._started_ns, end_ns)
             return Motion("moving", "", ticks, 0, self._started_ns)
 
-    def state(self, host_ns: int) -> tuple[Float[Array, " j"], Float[Array, " j"]]:
+    def states(self, host_ns: Int64[Array, " n"]) -> tuple[Float[Array, "n j"], Float[Array, "n j"]]:
         """True joint angles and speeds."""
         with self._lock:
-            if self._trajectory is None or (self._halted_ns is None and self._lab.stage.ready is not None):
-                return self._lab.show.start_rad(self._lab.stage.ready), np.zeros(7)
-            halted = self._halted_ns is not None and host_ns > self._halted_ns
-            at_ns = self._halted_ns if halted and self._halted_ns is not None else host_ns
-            q, dq = self._trajectory.at((at_ns - self._started_ns) / 1e9)
-            return q, np.zeros_like(dq) if halted else dq
+            stage, trajectory = self._lab.stage, self._trajectory
+            if trajectory is None or (self._halted_ns is None and stage.ready is not None):
+                q = np.tile(self._lab.show.start_rad(stage.ready), (len(host_ns), 1))
+                return q, np.zeros_like(q)
+            last_ns = host_ns if self._halted_ns is None else np.minimum(host_ns, self._halted_ns)
+            times_s = (last_ns - self._started_ns) / 1e9
+            moving = (times_s <= trajectory.duration_s) & (last_ns == host_ns)
+            q, dq = (
+                np.stack([np.interp(times_s, trajectory.time_s, column) for column in rows.T], axis=1)
+                for rows in (trajectory.q_rad, trajectory.dq_rad_s)
+            )
+            return q, np.where(moving[:, None], dq, 0.0)
 
     def width_m(self, host_ns: int) -> float:
         playing = self._lab.stage.playing(host_ns)
@@ -525,8 +534,7 @@ class SyntheticArm(_Device):
             self._moved_ns += round(step.number("by_s", 1.0) * 1e9)
             self._faults.clear("clock_step")
         true_ns = [self._lab.stage.epoch_ns + round(n * 1e9 / self.rate_hz) for n in numbers.tolist()]
-        desired = [self._lab.arm.state(t) for t in true_ns]
-        q, dq = np.array([d[0] for d in desired]), np.array([d[1] for d in desired])
+        q, dq = self._lab.arm.states(np.array(true_ns, dtype=np.int64))
         noise = self._rng.standard_normal((2, *q.shape)) * np.array(ARM_NOISE)[:, None, None]
         if self._faults.active("nan") is not None:
             noise = np.full_like(noise, np.nan)
@@ -632,6 +640,9 @@ class SyntheticThrower:
             self._lab.stage.set_up(self._lab.show.perform(number, plan, progress))
             self._ready = number, plan
         return self._ready[1]
+
+    def over(self) -> bool:
+        return False
 
     def learn(self, delay_s: float) -> None:
         pass

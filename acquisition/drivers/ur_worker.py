@@ -28,6 +28,8 @@ VARIABLES = [
 SILENT_S = 1.0
 """Without a new state for this long the arm counts as gone."""
 SCRIPT_S = 1.5
+CATCH_UP = 1.2
+"""So many samples of the path a cycle may go on by, when it was late before."""
 SERVO_STOP_RAD_S2 = 10.0
 ROBOT_RUNNING = 7
 
@@ -155,15 +157,19 @@ class Follower:
         self._began_s = time.monotonic()
         self._started = time.monotonic_ns()
         self._tick = -1
+        self._place = 0.0
         self._ticks = self._missed = 0
         end.event("motion", status="moving", started=self._started)
 
     def brake(self) -> None:
         if self._brake is None:
-            self._brake = Brake(float(max(self._tick, 0)), self._rate_hz)
+            self._brake = Brake(self._place, self._rate_hz)
 
     def step(self) -> bool:
-        """Send the next position, when it is due; whether the motion is over."""
+        """Send the next position, when it is due; whether the motion is over.
+
+        After a pause of this process the path is caught up with little by little: a jump would be a protective stop.
+        """
         tick = int((time.monotonic() - self._began_s) * self._rate_hz)
         if tick == self._tick:
             return False
@@ -171,13 +177,15 @@ class Follower:
         self._missed += elapsed - 1
         self._ticks += 1
         if self._brake is not None:
-            self._brake.advance(elapsed)
-        place = self._brake.place if self._brake else float(tick)
-        if not self._servo(along(self._path, place)):
+            self._brake.advance(1)
+            self._place = self._brake.place
+        else:
+            self._place += min(tick - self._place, CATCH_UP)
+        if not self._servo(along(self._path, self._place)):
             return self._over("aborted", self._stop_reason() or "the controller takes no more positions")
         if self._brake is not None and self._brake.standing:
             return self._over("aborted", "halted")
-        settled = tick / self._rate_hz > len(self._path) / self._rate_hz + 3 * self._options["lookahead_s"]
+        settled = self._place > len(self._path) + 3 * self._options["lookahead_s"] * self._rate_hz
         return self._over("done", "") if settled else False
 
     def _servo(self, q: Float[Array, "6"]) -> bool:

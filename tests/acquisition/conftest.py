@@ -21,7 +21,15 @@ from acquisition.verdict import Verdict
 from recordings.progress import Silent
 from recordings.session_writer import SessionWriter
 
-SMALL = SyntheticConfig(pictures="pool", color_size=(212, 120), mono_size=(160, 120), mono_cameras=1, wrap_after_s=-1.0)
+SMALL = SyntheticConfig(
+    pictures="pool",
+    color_size=(212, 120),
+    mono_size=(160, 120),
+    mono_cameras=1,
+    wrap_after_s=-1.0,
+    buffer_frames=150,  # the machine that tests may stop a process for seconds
+)
+PATIENT_S = 1.5
 WARM_UP_S = 0.7
 
 
@@ -60,10 +68,12 @@ def small_rig(**recording: Any) -> Rig:
     devices = (
         DeviceEntry("d455", "rgbd", "synthetic"),
         DeviceEntry("mono0", "mono", "synthetic"),
-        DeviceEntry("arm", "arm", "synthetic", rate_hz=1000.0),
+        DeviceEntry("arm", "arm", "synthetic", rate_hz=200.0),
         DeviceEntry("gripper", "gripper", "synthetic", rate_hz=50.0),
     )
-    config = replace(RecordingConfig(countdown_s=0.0, pre_trigger_s=0.3), **recording)
+    config = replace(
+        RecordingConfig(countdown_s=0.0, pre_trigger_s=0.3, queue_s=4.0, longest_gap_s=PATIENT_S), **recording
+    )
     return Rig("small", devices, Path("small.toml"), "panda", recording=config)
 
 

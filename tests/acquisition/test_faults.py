@@ -18,7 +18,19 @@ from recordings.mcap_sink import Sink
 from recordings.session import Session
 from recordings.verify import verify
 
+SMALL = SyntheticConfig(
+    pictures="pool",
+    color_size=(212, 120),
+    mono_size=(160, 120),
+    mono_cameras=1,
+    wrap_after_s=-1.0,
+    buffer_frames=150,
+)
 pytestmark = pytest.mark.filterwarnings("error::pytest.PytestUnhandledThreadExceptionWarning")
+
+
+BUSY_S = 2.0
+"""How long a busy machine may stop this process."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +56,7 @@ CASES = (
     Case("camera falls silent", "d455", "silence", "reject", "a stream fell silent (/d455/color"),
     Case("grey camera falls silent", "mono0", "silence", "reject", "a stream fell silent (/mono0/image"),
     Case("arm falls silent", "arm", "silence", "reject", "a stream fell silent (/arm/joint_states"),
-    Case("short silence", "mono0", "silence", "accept", "missing from the device", for_s=0.05),
+    Case("short silence", "mono0", "silence", "accept", "missing from the device", for_s=0.08),
     Case("frozen picture", "d455", "frozen", "reject", "a camera froze (/d455/color", quick=True),
     Case("frozen grey picture", "mono0", "frozen", "reject", "a camera froze (/mono0/image"),
     Case("every frame twice", "mono0", "duplicate", "accept", "duplicate"),
@@ -53,19 +65,19 @@ CASES = (
     Case("gap in the frame numbers", "mono0", "gap", "accept", "missing from the device", quick=True),
     Case("gap in both streams", "d455", "gap", "accept", "missing from the device"),
     Case("no trigger", "mono0", "lost_trigger", "reject", "a stream fell silent (/mono0/image"),
-    Case("three triggers lost", "mono0", "lost_trigger", "reject", "missing from the device", for_s=0.1),
+    Case("three triggers lost", "mono0", "lost_trigger", "reject", "missing from the device", for_s=0.2),
     Case("clock an hour on", "d455", "clock_step", "reject", "clock was set", detail=(("by_s", 3600.0),)),
     Case("clock an hour back", "mono0", "clock_step", "reject", "clock was set", detail=(("by_s", -3600.0),)),
     Case("clock 60 ms on", "mono0", "clock_step", "reject", "clock was set", detail=(("by_s", 0.06),), quick=True),
     Case("clock 60 ms back", "d455", "clock_step", "reject", "clock was set", detail=(("by_s", -0.06),)),
     Case("arm's clock set", "arm", "clock_step", "reject", "clock was set", detail=(("by_s", 5.0),)),
     Case("frames 50 ms late", "mono0", "late", "accept", "accept", detail=(("by_s", 0.05),)),
-    Case("some NaN states", "arm", "nan", "accept", "invalid", for_s=0.02),
+    Case("some NaN states", "arm", "nan", "accept", "invalid", for_s=0.06),
     Case("NaN states", "arm", "nan", "reject", "invalid", for_s=0.5),
     Case("reflex", "arm", "reflex", "reject", "the arm went into reflex", quick=True),
     Case("emergency stop", "arm", "user_stop", "reject", "emergency stop"),
     Case("gripper does not answer", "gripper", "gripper_timeout", "reject", "the gripper did not", at_s=0.0),
-    Case("driver hangs", "mono0", "hang", "reject", "a stream fell silent", for_s=3.0),
+    Case("driver hangs", "mono0", "hang", "reject", "a stream fell silent", for_s=3.5),
     Case("images of another size", "mono0", "wrong_size", "reject", "images of another size"),
     Case("no depth", "d455", "no_depth", "reject", "a stream fell silent (/d455/depth"),
 )
@@ -73,7 +85,8 @@ CASES = (
 
 @pytest.mark.parametrize("case", [pytest.param(c, id=c.name, marks=() if c.quick else pytest.mark.slow) for c in CASES])
 def test_a_fault_has_its_verdict_and_nothing_is_lost_in_silence(case: Case, record: Callable[..., Any]) -> None:
-    seconds = 3.6 if case.kind == "gripper_timeout" else 1.3
+    slow = case.kind in ("gripper_timeout", "silence", "lost_trigger", "no_depth", "hang") and not (case.for_s or 9) < 1
+    seconds = 4.0 if slow else 3.0 if case.decision == "accept" else 1.3
 
     def inject(lab: SyntheticLab) -> None:
         lab.faults(case.device).inject(case.kind, at_s=case.at_s, for_s=case.for_s, **dict(case.detail))
@@ -81,7 +94,7 @@ def test_a_fault_has_its_verdict_and_nothing_is_lost_in_silence(case: Case, reco
     done = record(inject, seconds=seconds)
     assert done.take.decision == case.decision, done.take.verdict.text()
     assert case.says in done.take.verdict.text()
-    assert done.seconds < seconds + 2.0
+    assert done.seconds < seconds + 2.0 + BUSY_S
     assert_everything_is_counted(done)
 
 
@@ -110,7 +123,7 @@ def test_a_camera_that_comes_back_serves_the_next_take(record: Callable[..., Any
 
 @pytest.mark.slow
 def test_frames_lost_now_and_then_are_counted_one_by_one(record: Callable[..., Any]) -> None:
-    done = record(config=replace(SyntheticConfig(), **{**_small(), "dropped_share": 0.02}), seconds=3.0)
+    done = record(config=replace(SMALL, dropped_share=0.02), seconds=3.0)
     missed = sum(t.missed for t in done.take.counts.values())
     assert done.take.decision == "accept"
     assert 0 < missed < 20
@@ -119,7 +132,7 @@ def test_frames_lost_now_and_then_are_counted_one_by_one(record: Callable[..., A
 
 @pytest.mark.slow
 def test_the_32_bit_clock_may_start_over_within_a_take(record: Callable[..., Any]) -> None:
-    done = record(config=replace(SyntheticConfig(), **{**_small(), "wrap_after_s": 1.4}), seconds=1.5)
+    done = record(config=replace(SMALL, wrap_after_s=1.4), seconds=1.5)
     clock = next(c for name, c in done.clocks.items() if name.startswith("d455"))
     assert clock["wraps"] == 1
     assert not clock["steps"]
@@ -127,13 +140,6 @@ def test_the_32_bit_clock_may_start_over_within_a_take(record: Callable[..., Any
     with Session.open(done.folder) as session:
         times_ns = session.toss(0).color().times_ns
     assert 25e6 < min(times_ns[1:] - times_ns[:-1]) < max(times_ns[1:] - times_ns[:-1]) < 42e6
-
-
-def _small() -> dict[str, Any]:
-    from dataclasses import asdict
-
-    kept = asdict(SyntheticConfig())
-    return {**kept, "pictures": "pool", "color_size": (212, 120), "mono_size": (160, 120), "mono_cameras": 1}
 
 
 @pytest.mark.parametrize(
@@ -159,7 +165,7 @@ def test_a_disk_that_refuses_ends_the_take_at_once(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("stall_s, decision", [(0.2, "accept"), (3.0, "reject")])
+@pytest.mark.parametrize("stall_s, decision", [(0.2, "accept"), (6.0, "reject")])
 def test_a_slow_disk_costs_counted_frames_and_never_holds_a_driver(
     stall_s: float, decision: str, record: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -172,7 +178,7 @@ def test_a_slow_disk_costs_counted_frames_and_never_holds_a_driver(
         plain(self, data)
 
     monkeypatch.setattr(Sink, "_write", slow)
-    done = record(seconds=2.5)
+    done = record(seconds=2.5 if decision == "accept" else 7.5)
     assert done.take.decision == decision, done.take.verdict.text()
     if decision == "reject":
         assert "queue full" in done.take.verdict.text()
