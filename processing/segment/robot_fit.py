@@ -247,7 +247,7 @@ def _depth_rows(sight: Sight, view: RobotView, state: _State, gate_m: float, s: 
     points = rays * drawn_m[:, None]
     along = (normal * rays).sum(-1)  # how a change of depth moves the point along the normal
     raw = along * (measured_m / state.scale - drawn_m)
-    sigma = np.maximum(stereo_sigma_m(drawn_m), 0.001) * np.maximum(np.abs(along), 0.2)
+    sigma = np.maximum(stereo_sigma_m(image.depth_m[use]), 0.001) * np.maximum(np.abs(along), 0.2)
     velocity = _velocities(sight, state, time_ns, view, image.part[use], points)
     J = _by_motion(normal, points - _center(state.camera_from_base), velocity)
     J[:, SCALE] = -along * measured_m / state.scale
