@@ -33,6 +33,8 @@ class InterpolationConfig:
     """An interval longer than this many usual ones is a gap: what lies in it is uncertain."""
     meet_share: float = 0.25
     """Motions before and after an impact meet when they come nearer than this share of what parts them elsewhere."""
+    meet_doubt: float = 0.05
+    """This share of it is doubt that one impact was all."""
     impact_steps: int = 40
     """Instants of an interval at which an impact is tried."""
     reach: float = 0.6
@@ -252,11 +254,12 @@ def _meeting(
         return None
     a, b, impact = float(tried[0]), float(tried[-1]), float(tried[best])
     share = (impact - a) / (b - a)
+    loose = 0.5 * float(apart[best]) + config.meet_doubt * float(max(apart[0], apart[-1]))
     if t < impact:
         along = (t - a) / (impact - a)
-        return _Meeting(True, share * along * gaps[best], 0.5 * float(apart[best]) * along)
+        return _Meeting(True, share * along * gaps[best], loose * along)
     along = (b - t) / max(b - impact, 1e-9)
-    return _Meeting(False, -(1 - share) * along * gaps[best], 0.5 * float(apart[best]) * along)
+    return _Meeting(False, -(1 - share) * along * gaps[best], loose * along)
 
 
 def _bridged(motion: Motion, k: int, t: float, clean: int | None) -> tuple[Float[Array, "4 4"], float, float]:

@@ -50,6 +50,8 @@ class SolveConfig:
     fall_m_s2: float = 0.6
     """How far from gravity the acceleration of flight may be; beyond three times this an arc hardly counts."""
     turn_rad_s2: float = 6.0
+    center_sigma_m: float = 0.02
+    """Of the centre of mass about the middle of the tags."""
     rounds: int = 3
     """Of the arcs' robust weights."""
 
@@ -121,9 +123,10 @@ def solve_session(
     order = _order(sightings, index)
     drifting = _let_cameras_drift(graph, problem, index, sightings, config)
     solution = solve(graph, settings.solver)
-    center = np.zeros(3)
+    middle = np.mean([solution.poses[index[tag_key(i)]][:3, 3] for i in roles.body if tag_key(i) in index], axis=0)
+    center = middle
     for _ in range(config.rounds):
-        center = _center_of_mass(solution.poses, order, center)
+        center = _center_of_mass(solution.poses, order, middle, config)
         graph.arcs = _arcs(solution.poses, order, center, config)
         if not graph.arcs:
             break
@@ -252,9 +255,11 @@ def _let_cameras_drift(
     return drifting
 
 
-def _center_of_mass(poses: Float[Array, "n 4 4"], order: Order, center: Float[Array, "3"]) -> Float[Array, "3"]:
-    """c with p + R c falling: second differences of p + R c equal gravity in all triples that are nearly in flight now
-    (robust linear least squares). The old one where too little of the motion is flight."""
+def _center_of_mass(
+    poses: Float[Array, "n 4 4"], order: Order, middle: Float[Array, "3"], config: SolveConfig
+) -> Float[Array, "3"]:
+    """c with p + R c falling: second differences of p + R c equal gravity in all triples that are nearly in flight
+    (robust linear least squares), and c is near the middle of the tags, as far as flight does not tell."""
     rows, values = [], []
     for times, numbers in order.values():
         for k in range(1, len(numbers) - 1):
@@ -266,14 +271,16 @@ def _center_of_mass(poses: Float[Array, "n 4 4"], order: Order, center: Float[Ar
             three = poses[numbers[k - 1 : k + 2]]
             rows.append(np.einsum("i,ijk->jk", shares, three[:, :3, :3]))
             values.append(GRAVITY_M_S2 - shares @ three[:, :3, 3])
+    center = middle
     if not rows:
         return center
     A, b = np.array(rows), np.array(values)
     for _ in range(20):
         left = np.linalg.norm(b - A @ center, axis=1)
-        weight = (left < 15.0) / (1 + (left / 1.5) ** 2) ** 2
-        information = np.einsum("n,nij,nik->jk", weight, A, A) + 100.0 * np.eye(3)  # 0.1 m about the frame's origin
-        center = np.linalg.solve(information, np.einsum("n,nij,ni->j", weight, A, b))
+        weight = 1 / (1 + (left / (2.5 * config.fall_m_s2)) ** 2) ** 2 / config.fall_m_s2**2
+        near = 1 / config.center_sigma_m**2
+        information = np.einsum("n,nij,nik->jk", weight, A, A) + near * np.eye(3)
+        center = np.linalg.solve(information, np.einsum("n,nij,ni->j", weight, A, b) + near * middle)
     return center
 
 

@@ -56,7 +56,7 @@ class TruthConfig:
     """A given tag size may differ from the measured one by this share: corners of small tags lie a little inside."""
     tracked_m: float = 0.0015
     tracked_rad: float = 0.01
-    """A pose is `tracked` when its standard deviations are below these, else `interpolated`."""
+    """A pose is `tracked` when its standard deviations (over all axes) are below these, else `interpolated`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,8 +196,8 @@ def _at_color_frames(session: Session, toss: int, solved: Solved, config: TruthC
         own[range(3, 6), range(3, 6)] += found.extra_m[i] ** 2
         turn = np.kron(np.eye(2), pose[:3, :3])
         covariance[i] = turn @ own @ turn.T
-        sigma = np.sqrt(np.diag(own))
-        good = sigma[:3].max() <= config.tracked_rad and sigma[3:].max() <= config.tracked_m
+        turn_rad, shift_m = np.sqrt(np.trace(own[:3, :3])), np.sqrt(np.trace(own[3:, 3:]))
+        good = turn_rad <= config.tracked_rad and shift_m <= config.tracked_m
         status.append("tracked" if good else "interpolated")
     return TossTruth(times_ns, found.poses, covariance, tuple(status))
 
