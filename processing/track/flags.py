@@ -27,7 +27,7 @@ class FlagConfig:
     """Standard deviation of an interpolated pose in the middle of the longest gap."""
     rival_cost: float = 0.0015
     """Another story of the same frames that fits worse by this much counts half as evidence of doubt."""
-    unsure_deg: float = 15.0
+    unsure_deg: float = 25.0
     """A pose whose rotation may be off by more than this (standard deviation) is a guess: marked as interpolated."""
 
 

@@ -186,11 +186,12 @@ def test_hidden_frames_are_interpolated_or_lost_but_never_silent(tiny_world: Any
 
 def test_depth_exposed_late_is_moved_to_the_color(tiny_world: Any, toss: Any) -> None:
     late = []
-    for i, frame in enumerate(toss[0]):
+    count = 7
+    for i, frame in enumerate(toss[0][:count]):
         nearer = min(i + 1, COUNT - 1)
         late.append(replace(frame, depth_m=toss[0][nearer].depth_m, depth_time_ns=toss[0][nearer].time_ns))
-    estimate = followed(tiny_world, (late, toss[1])).track.camera_from_object
-    errors = frame_errors(estimate @ align_first(estimate, toss[2]), toss[2], np.eye(3) * 0.05)
+    estimate = followed(tiny_world, (late, toss[1][:count])).track.camera_from_object
+    errors = frame_errors(estimate @ align_first(estimate, toss[2][:count]), toss[2][:count], np.eye(3) * 0.05)
     assert np.median(errors.translation_m) < 0.008
 
 
