@@ -100,3 +100,11 @@ def db3(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
 def free_host() -> str:
     """A loopback address where nobody listens."""
     return host()
+
+
+@pytest.fixture(scope="session")
+def shipped_session() -> Path:
+    """The session that the repository ships."""
+    import recordings
+
+    return Path(recordings.__file__).parent / "samples" / "box_toss"

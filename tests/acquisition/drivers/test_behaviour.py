@@ -134,6 +134,27 @@ def synthetic(name: str, kind: str, protocol: Any, rate_hz: float = 30.0) -> Ite
     yield Backend(make, protocol, lossy, lambda: lab.faults(name).inject("unplug"))
 
 
+@contextmanager
+def replay(name: str, protocol: Any, ask: Callable[[str], Any]) -> Iterator[Backend]:
+    """A device of the session that the repository ships, played in real time."""
+    from acquisition.drivers.replay import Player, ReplayMono, ReplayRgbd
+    from recordings.session import Session
+
+    player = Player(Session.open(ask("shipped_session")))
+    made = ReplayRgbd if protocol is RgbdCamera else ReplayMono
+
+    def make(**given: Any) -> Any:
+        if given:
+            pytest.skip("a replayed device is what its session calls it: it takes no serial")
+        player.play(player.session.tosses[0])
+        return made(player, name)
+
+    def nothing() -> Any:
+        pytest.skip("a session keeps what it recorded: its replay loses nothing and stays")
+
+    yield Backend(make, protocol, nothing, nothing)
+
+
 BACKENDS: dict[str, Callable[[Callable[[str], Any]], AbstractContextManager[Backend]]] = {
     "d455": d455,
     "genicam": genicam,
@@ -144,6 +165,8 @@ BACKENDS: dict[str, Callable[[Callable[[str], Any]], AbstractContextManager[Back
     "synthetic_mono": lambda ask: synthetic("mono0", "mono", MonoCamera),
     "synthetic_arm": lambda ask: synthetic("arm", "arm", Arm, 1000.0),
     "synthetic_gripper": lambda ask: synthetic("gripper", "gripper", Gripper),
+    "replay_rgbd": lambda ask: replay("d455", RgbdCamera, ask),
+    "replay_mono": lambda ask: replay("mono0", MonoCamera, ask),
 }
 
 
