@@ -115,7 +115,7 @@ def _fitted(
     pose[:3, :3] = start
     pose[:3, 3] = middle - start @ corners.mean(axis=0)
     rms = np.inf
-    for _ in range(25):
+    for turning in [False] * 6 + [True] * 25:  # first into place: the tags' middle need not be the object's
         moved = corners @ pose[:3, :3].T + pose[:3, 3]
         points, normals = surface.nearest(moved)
         turned = outward @ pose[:3, :3].T
@@ -124,12 +124,15 @@ def _fitted(
         rms = float(np.sqrt((np.linalg.norm(moved - points, axis=1) ** 2).mean() + (tilt**2).sum(axis=1).mean()))
         A = np.concatenate([np.cross(moved, normals), normals], axis=1)
         lean = np.concatenate([0.03 * _lean(turned), np.zeros((3 * len(turned), 3))], axis=1)
-        step = np.linalg.lstsq(np.concatenate([A, lean]), np.concatenate([-off, tilt.ravel()]), rcond=None)[0]
+        if turning:
+            step = np.linalg.lstsq(np.concatenate([A, lean]), np.concatenate([-off, tilt.ravel()]), rcond=None)[0]
+        else:
+            step = np.concatenate([np.zeros(3), np.linalg.lstsq(normals, -off, rcond=None)[0]])
         step[:3] *= min(1.0, 0.3 / max(float(np.linalg.norm(step[:3])), 1e-9))
         R = Rotation.from_rotvec(step[:3]).as_matrix()
         pose[:3, 3] = R @ pose[:3, 3] + step[3:]
         pose[:3, :3] = R @ pose[:3, :3]
-        if np.linalg.norm(step) < 1e-7:
+        if turning and np.linalg.norm(step) < 1e-7:
             break
     if (
         np.einsum("ij,ij->i", outward @ pose[:3, :3].T, surface.nearest(corners @ pose[:3, :3].T + pose[:3, 3])[1]) < 0
