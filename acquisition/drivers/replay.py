@@ -201,11 +201,9 @@ def _samples(arm: ArmStates, rows: Int64[Array, " n"], base: int, now: int) -> A
     q, dq = arm.q_rad[rows], arm.dq_rad_s[rows]
     received = now - (arm.time_ns[rows[-1]] - arm.time_ns[rows])
     none = np.full_like(q, np.nan)
-    ones = np.ones(len(rows))
-    modes = ("idle",) * len(rows)
-    return ArmSamples(
-        CLOCK, base + rows.astype(np.int64), arm.time_ns[rows], received, q, dq, none, none, none, ones, modes
-    )
+    numbers, ones = base + rows.astype(np.int64), np.ones(len(rows))
+    modes: tuple[ArmMode, ...] = tuple(IDLE for _ in rows)
+    return ArmSamples(CLOCK, numbers, arm.time_ns[rows], received, q, dq, none, none, none, ones, modes)
 
 
 class _Replayed:

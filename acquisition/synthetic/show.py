@@ -170,6 +170,10 @@ class Show:
         """What happens when the arm follows a plan, with a gripper that takes its own time; rendered."""
         if not self.rendered:
             return _pool(self.config, plan.trajectory, self.phases_s())
+        return perform(self.lab, self.motion(toss, plan), self.config.fps, progress)
+
+    def motion(self, toss: int, plan: TossPlan) -> Motion:
+        """What arm and object do, not rendered."""
         drawn_ms = generator(self.config.seed, GRIPPER, toss).normal(
             self.config.gripper_delay_ms, self.config.gripper_delay_sigma_ms
         )
@@ -184,7 +188,7 @@ class Show:
             self.held_width_m,
             plan.trajectory,
         )
-        return perform(self.lab, self.lab.planner.follow(toss, swing), self.config.fps, progress)
+        return self.lab.planner.follow(toss, swing)
 
     def is_of(self, performance: Performance, trajectory: JointTrajectory) -> bool:
         """Whether a performance was made for this trajectory."""

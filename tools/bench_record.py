@@ -1,0 +1,418 @@
+"""The recorder's figures. Each prints what was got and what was wanted.
+
+python tools/bench_record.py rates [--seconds 60]       # the lab's rates: nothing unaccounted, CPU, queues
+python tools/bench_record.py soak [--seconds 600]       # half rate: growth of memory; finished takes make room
+python tools/bench_record.py kill [--count 100]         # kill -9 at random instants: recovery, resuming
+python tools/bench_record.py clock                      # mapping error on drifting clocks under load, steps, wraps
+python tools/bench_record.py detect [--count 200]       # release and impact of simulated tosses against the truth
+python tools/bench_record.py plans [--count 1000]       # random targets: every accepted plan within its limits
+python tools/bench_record.py tags                       # what JPEG does to tag corners in mono images, size and cost
+python tools/bench_record.py faults                     # the injected faults, as tests/acquisition/test_faults.py
+"""
+
+# long because: eight measurements, each a few functions
+from __future__ import annotations
+
+import argparse
+import os
+import random
+import resource
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT))
+
+from acquisition.clock import ClockMapper, SessionClock  # noqa: E402
+from acquisition.detect import Eye, TossWatcher  # noqa: E402
+from acquisition.drivers.synthetic import SyntheticConfig, SyntheticLab, SyntheticThrower  # noqa: E402
+from acquisition.operator import Nobody  # noqa: E402
+from acquisition.recorder import Recorder  # noqa: E402
+from acquisition.rig import DeviceEntry, RecordingConfig, Rig, TossConfig  # noqa: E402
+from acquisition.run import Options, SessionRun  # noqa: E402
+from acquisition.toss import (  # noqa: E402
+    ReleaseDelay,
+    Samples,
+    TossRefused,
+    check_limits,
+    draw_target,
+    plan_toss,
+)
+from acquisition.toss_limits import arm_model  # noqa: E402
+from acquisition.verdict import Verdict  # noqa: E402
+from recordings.geometry import Transform, rotation_exp  # noqa: E402
+from recordings.progress import Silent  # noqa: E402
+from recordings.session import Session  # noqa: E402
+from recordings.session_resume import next_toss, resume_session  # noqa: E402
+from recordings.session_writer import SessionWriter, file_sha256  # noqa: E402
+from recordings.verify import verify  # noqa: E402
+
+LAB = SyntheticConfig(pictures="pool", color_size=(848, 480), mono_size=(1440, 1080))
+TINY = SyntheticConfig(pictures="pool", color_size=(212, 120), mono_size=(160, 120), mono_cameras=1)
+
+
+class Quiet(Nobody):
+    """Says nothing, keeps every take: the counts are what is looked at."""
+
+    def say(self, text: str) -> None:
+        pass
+
+    def decide(self, verdict: Verdict) -> Any:
+        return "accept"
+
+
+def rig(config: SyntheticConfig, **recording: Any) -> Rig:
+    monos = tuple(DeviceEntry(f"mono{k}", "mono", "synthetic", rate_hz=config.fps) for k in range(config.mono_cameras))
+    devices = (
+        DeviceEntry("d455", "rgbd", "synthetic", rate_hz=config.fps),
+        *monos,
+        DeviceEntry("arm", "arm", "synthetic", rate_hz=1000.0),
+        DeviceEntry("gripper", "gripper", "synthetic", rate_hz=50.0),
+    )
+    return Rig("bench", devices, Path("bench.toml"), "panda", recording=RecordingConfig(countdown_s=0.0, **recording))
+
+
+def record(
+    config: SyntheticConfig, folder: Path, seconds: float, tosses: int, each: Any = None, **recording: Any
+) -> Any:
+    """Takes of a fixed length; `each(run, report)` after every one. Returns report, tallies, clocks, recorder."""
+    lab, a_rig = SyntheticLab(config), rig(config, **recording)
+    thrower = SyntheticThrower(lab)
+    thrower.prepare(0, 0, Silent())
+    devices = {d.name: lab.device(d.name, d.kind, d.rate_hz) for d in a_rig.devices}
+    recorder = Recorder(a_rig, devices, SessionClock(time.monotonic_ns(), time.time_ns()))
+    with recorder:
+        time.sleep(2.0)
+        with SessionWriter(folder, {"object": {"name": "bench"}}, lab.show.calibration()) as session:
+            run = SessionRun(recorder, thrower, session, lab.show.calibration(), Quiet(), Silent())
+            reports = []
+            for toss in range(tosses):
+                report = run.record(Options(1, toss, fixed_s=seconds))
+                reports += report.takes
+                if each is not None:
+                    each(session, toss, report)
+            session.finish()
+        clocks = recorder.clocks()
+    return reports, recorder.tallies(), clocks, recorder
+
+
+def bench_rates(seconds: float) -> bool:
+    with tempfile.TemporaryDirectory(dir=os.environ.get("TMPDIR")) as place:
+        folder = Path(place) / "session"
+        before = resource.getrusage(resource.RUSAGE_SELF)
+        started = time.monotonic()
+        reports, tallies, clocks, recorder = record(LAB, folder, seconds, 1)
+        wall_s = time.monotonic() - started
+        after = resource.getrusage(resource.RUSAGE_SELF)
+        cpu_s = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+        session = Session.open(folder)
+        counts = {topic: info.count for topic, info in session.toss(0).streams().items()}
+        take = reports[0]
+        good = True
+        print(f"{seconds:g} s at the lab's rates, {wall_s:.0f} s in all, {take.bytes / 1e6 / seconds:.0f} MB/s on disk")
+        for topic, tally in take.counts.items():
+            whole = tallies[topic]
+            unaccounted = whole.received - whole.written - whole.dropped_total - whole.idle
+            same = counts.get(topic, 0) == tally.written
+            good &= unaccounted == 0 and same
+            fullest, held = recorder.lanes[topic].fullest, counts.get(topic, 0)
+            print(
+                f"  {topic:<20} received {tally.received:>6} written {tally.written:>6} in file {held:>6} "
+                f"dropped {tally.dropped_total:>4} missed {tally.missed:>4} unaccounted {unaccounted} queue {fullest}"
+            )
+        for name, clock in clocks.items():
+            print(f"  clock {name}: sigma {1e3 * clock['sigma_s']:.4f} ms, drift {1e6 * clock['drift']:+.2f} ppm")
+        print(f"  CPU {cpu_s / wall_s:.2f} s per second, machine load {os.getloadavg()[0]:.1f} (wanted: 0 unaccounted)")
+    return good
+
+
+def bench_soak(seconds: float) -> bool:
+    config = replace(LAB, fps=15.0)
+    sizes: list[float] = []
+
+    def each(session: SessionWriter, toss: int, report: Any) -> None:
+        path = session.folder / f"toss_{toss:02d}.mcap"
+        assert path.stat().st_size > 1e6
+        with open("/proc/self/statm") as file:
+            sizes.append(int(file.read().split()[1]) * resource.getpagesize() / 1e6)
+        os.truncate(path, 0)  # a finished take makes room for the next one; its sha256 stays in the session
+
+    with tempfile.TemporaryDirectory(dir=os.environ.get("TMPDIR")) as place:
+        takes = max(int(seconds / 12), 3)
+        reports, tallies, _, _ = record(config, Path(place) / "session", 12.0, takes, each)
+    settled = sizes[len(sizes) // 4 :]
+    growth = settled[-1] - settled[0]
+    unaccounted = sum(t.received - t.written - t.dropped_total - t.idle for t in tallies.values())
+    lost = sum(t.dropped_total + t.missed for r in reports for t in r.counts.values())
+    print(
+        f"{takes * 12} s at half rate: RSS {settled[0]:.0f} -> {settled[-1]:.0f} MB, growth {growth:+.1f} (wanted < 50)"
+    )
+    print(f"  unaccounted {unaccounted}, counted as lost {lost}")
+    return growth < 50 and unaccounted == 0
+
+
+def bench_kill(count: int) -> bool:
+    rng, good, lost_frames = random.Random(4), 0, []
+    for k in range(count):
+        with tempfile.TemporaryDirectory() as place:
+            folder = Path(place) / "session"
+            child = subprocess.Popen([sys.executable, __file__, "child", str(folder)], cwd=ROOT)
+            while not (folder / "toss_00.mcap").exists():
+                time.sleep(0.02)
+            time.sleep(rng.uniform(0.0, 4.0))
+            os.kill(child.pid, signal.SIGKILL)
+            child.wait()
+            sealed = {p.name: file_sha256(p) for p in folder.glob("toss_*.mcap") if verify(p).ok}
+            session, recovered = resume_session(folder)
+            with session:
+                number = next_toss(folder)
+                with session.toss(number) as toss:
+                    toss.dropped("/d455/color", 0)
+                session.finish()
+            untouched = all(file_sha256(folder / name) == sha for name, sha in sealed.items())
+            whole = verify(folder).ok
+            good += untouched and whole
+            lost_frames.append(sum(1 for r in recovered))
+            if not (untouched and whole):
+                print(f"  kill {k}: untouched {untouched}, whole {whole}: {verify(folder)}")
+    print(f"kill -9: {good} of {count} sessions recovered, finished tosses untouched, resumed (wanted: all)")
+    return good == count
+
+
+def child(folder: Path) -> None:
+    """Records short takes until it is killed."""
+    record(TINY, folder, 0.8, 1000)
+
+
+def bench_clock() -> bool:
+    worst, missed, steps = 0.0, 0, 0
+    for seed in range(10):
+        _, error_ms = clock_run(seed)
+        worst = max(worst, float(error_ms[300:].std()))
+    for seed in range(20):
+        for by_ns in (3e6, -3e6, 20e6, -20e6, 5e8, -5e8, 3.6e12, -3.6e12):
+            mapper, _ = clock_run(100 + seed, 20.0, (300, by_ns))
+            steps += 1
+            missed += not (len(mapper.steps) == 1 and abs(mapper.steps[0].by_ns - by_ns) < 2e6)
+    wraps = 0
+    for seed in range(10):
+        wrap_ns = 2**32 * 1000
+        mapper, _ = clock_run(seed, 20.0, None, wrap_ns, wrap_ns - (seed + 2) * 10**9)
+        wraps += mapper.wraps == 1 and not mapper.steps
+    print(f"clock mapping, 25 ppm, 30 % of frames held up: worst std {worst:.4f} ms after 10 s (wanted <= 0.05)")
+    print(f"  steps seen {steps - missed} of {steps}, wraps {wraps} of 10 (wanted: all)")
+    return worst <= 0.05 and missed == 0 and wraps == 10
+
+
+def clock_run(
+    seed: int, seconds: float = 60.0, step: Any = None, wrap_ns: int | None = None, starts_ns: int = 5 * 10**9
+) -> tuple[ClockMapper, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    mapper, errors = ClockMapper(wrap_ns), []
+    for k in range(int(seconds * 30)):
+        true_ns = k / 30 * 1e9 + rng.normal(0, 2e5)
+        device_ns = starts_ns + true_ns * (1 + 25e-6) + (step[1] if step and k >= step[0] else 0.0)
+        latency_ns = 4e6 + rng.exponential(1e6) + (rng.random() < 0.3) * rng.exponential(10e6)
+        stamp_ns = int(device_ns) // 1000 * 1000
+        unwrapped = mapper.add(stamp_ns % wrap_ns if wrap_ns else stamp_ns, int(10**12 + true_ns + latency_ns), k)
+        line = mapper.line()
+        assert line is not None
+        errors.append((line.host_ns(unwrapped) - 10**12 - true_ns) / 1e6)
+    return mapper, np.array(errors)
+
+
+def bench_detect(count: int) -> bool:
+    """Motions of the simulated lab, depth at thumbnail size, widths at 50 Hz: nothing else is rendered."""
+    per_lab = 50
+    hits: Counter[str] = Counter()
+    early, done = 0, 0
+    for seed in range(11, 11 + -(-count // per_lab)):
+        for off, late_s in toss_by_toss(seed, min(per_lab, count - done)):
+            done += 1
+            for name, error in off.items():
+                hits[name] += error is not None and abs(error) <= 1.0
+            early += late_s is None or late_s < -0.2
+    print(f"toss detection, {done} tosses, within one frame of the truth (wanted: release and impact >= 98 %):")
+    for name in ("release", "first impact"):
+        print(f"  {name}: {hits[name]} ({100 * hits[name] / done:.1f} %)")
+    print(f"  ended before the object was at rest (by more than 0.2 s), or never: {early}")
+    return min(hits["release"], hits["first impact"]) >= 0.98 * done
+
+
+def toss_by_toss(seed: int, count: int) -> Any:
+    from acquisition.synthetic.show import Show
+
+    show = Show(SyntheticConfig(seed=seed, color_size=(212, 120)))
+    base = show.lab.believed_world_from_base
+    assert base is not None
+    eye = Eye(
+        show.lab.d455.camera,
+        show.lab.believed_world_from_d455,
+        1,
+        arm_model("panda"),
+        Transform("world", "base", base.rotation, base.translation_m),
+    )
+    for toss in range(count):
+        motion = show.motion(toss, show.plan(toss))
+        rng = np.random.default_rng((seed, toss))
+        end_s = motion.instants.end_s
+        times_s = np.arange(rng.uniform(0, 1 / 30), end_s, 1 / 30)
+        raws = [show.lab.depth(show.lab.sight(motion, t), toss, k) for k, t in enumerate(times_s)]
+        swing = motion.swing
+        assert swing is not None
+        widths = [
+            (float(t), swing.finger_width_m(t) + rng.normal(0, 2e-5))
+            for t in np.arange(rng.uniform(0, 0.02), end_s, 0.02)
+        ]
+        eye.learn(raws[:3], 0.001)
+        watcher, over_s, told = TossWatcher(), None, 0
+        for t, raw in zip(times_s, raws):
+            while told < len(widths) and widths[told][0] <= t:
+                watcher.width(*widths[told])
+                told += 1
+            q = swing.q_rad(float(t))
+            watcher.saw(eye.see(float(t), raw, 0.001, q, watcher.expected_m(float(t), eye.tool_m(q))))
+            if over_s is None and watcher.over(float(t)):
+                over_s = float(t)
+        found, true = watcher.events(), motion.instants
+        off = {
+            "release": None if found.release is None else 30 * (found.release.time_s - true.release_s),
+            "first impact": None
+            if found.first_impact is None
+            else 30 * (found.first_impact.time_s - true.first_impact_s),
+        }
+        yield off, None if over_s is None else over_s - true.rest_s
+
+
+def bench_plans(count: int) -> bool:
+    """Releases all over the table at up to 1.5 m/s, some of them impossible."""
+    good = True
+    for name in ("panda", "ur5e"):
+        rng, model = np.random.default_rng(0), arm_model(name)
+        base = Transform("world", "base", rotation_exp(np.array([0.0, 0.0, -np.pi / 2])), np.array([0.0, 0.6, 0.0]))
+        accepted, broken, why = 0, 0, Counter[str]()
+        started = time.process_time()
+        for _ in range(count):
+            config = TossConfig(
+                position_m=tuple(rng.uniform([-0.25, -0.1, 0.15], [0.25, 0.3, 0.55]).tolist()),
+                velocity_m_s=tuple(rng.uniform([-0.6, -1.2, -0.3], [0.6, 0.2, 1.0]).tolist()),
+                spin_rad_s=tuple(rng.uniform(-1, 1, 3).tolist()),
+                approach=(float(rng.uniform(-0.5, 0.5)), float(rng.uniform(-0.8, 0.2)), -1.0),
+                roll_deg=float(rng.uniform(-60, 60)),
+                position_spread_m=0.0,
+                velocity_spread_m_s=0.0,
+            )
+            try:
+                plan = plan_toss(model, base, draw_target(config, 0), ReleaseDelay(0.06, 0.01))
+            except TossRefused as refused:
+                text = str(refused)
+                why[text.split(": ")[1].split(" at ")[0] if "refused: " in text else "out of reach"] += 1
+                continue
+            accepted += 1
+            t = plan.trajectory
+            ddq = np.gradient(t.dq_rad_s, t.time_s, axis=0)  # from positions and speeds alone, not the planner's own
+            breach = check_limits(model, Samples(t.time_s, t.q_rad, t.dq_rad_s, ddq))
+            broken += breach is not None
+            if breach is not None:
+                print(f"  {breach}")
+        good &= broken == 0
+        print(
+            f"{name}: {accepted} of {count} random releases accepted, {broken} of them break a limit (wanted: 0), "
+            f"{(time.process_time() - started) / count:.2f} CPU-s each"
+        )
+        for text, number in why.most_common(6):
+            print(f"  refused {number}: {text}")
+    return good
+
+
+def bench_tags() -> bool:
+    """Corners of the same images raw and compressed; the scene is rendered at the lab's size with its noise."""
+    from acquisition.synthetic.config import MonoConfig
+    from acquisition.synthetic.lab import Lab
+    from acquisition.synthetic.show import scene_config
+    from calibration.tags import detect_tags
+
+    config = SyntheticConfig(seed=5)
+    scene = scene_config(config)
+    lab = Lab(replace(scene, mono=MonoConfig(subframes=2), still_rays=3_000_000))
+    motion = lab.plan(0)
+    raw = [
+        lab.mono(camera, motion, float(t), k)
+        for camera in range(3)
+        for k, t in enumerate(np.linspace(0.2, motion.instants.end_s, 4))
+    ]
+    reference = detect_tags(raw, jobs=1)
+    again = detect_tags([_noisier(image, k) for k, image in enumerate(raw)], jobs=1)
+    print(f"tag corners, {len(raw)} mono images of 1440x1080, {sum(map(len, reference))} tags (wanted: < 0.02 px)")
+    print(f"  one more grey level of noise moves them by {_moved(reference, again):.4f} px (sigma a coordinate)")
+    for quality in (90, 95, 98, 100):
+        started = time.process_time()
+        data = [cv2.imencode(".jpg", i, [cv2.IMWRITE_JPEG_QUALITY, quality])[1] for i in raw]
+        cpu_ms = 1e3 * (time.process_time() - started) / len(raw)
+        found = detect_tags([cv2.imdecode(d, cv2.IMREAD_UNCHANGED) for d in data], jobs=1)
+        size = np.mean([len(d) for d in data]) / 1e3
+        print(f"  JPEG {quality}: {_moved(reference, found):.4f} px, {size:.0f} kB, {cpu_ms:.1f} ms")
+    import zstandard
+
+    started = time.process_time()
+    sizes = [len(zstandard.ZstdCompressor(level=1).compress(i.tobytes())) for i in raw]
+    cpu_ms = 1e3 * (time.process_time() - started) / len(raw)
+    print(f"  zstd-1 (lossless): 0 px, {np.mean(sizes) / 1e3:.0f} kB, {cpu_ms:.1f} ms")
+    return True
+
+
+def _noisier(image: np.ndarray, seed: int) -> np.ndarray:
+    noise = np.random.default_rng(seed).normal(0, 1.0, image.shape)
+    return np.clip(np.rint(image + noise), 0, 255).astype(np.uint8)
+
+
+def _moved(before: Any, after: Any) -> float:
+    """Standard deviation, per coordinate, of how far the corners of the same tags moved."""
+    moved = []
+    for a, b in zip(before, after):
+        there = {t.tag_id: t.corners_px for t in b}
+        moved += [there[t.tag_id] - t.corners_px for t in a if t.tag_id in there]
+    return float(np.std(np.concatenate(moved)))
+
+
+def bench_faults() -> bool:
+    command = [sys.executable, "-m", "pytest", "-q", "tests/acquisition/test_faults.py"]
+    return subprocess.run(command, cwd=ROOT, check=False).returncode == 0
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", nargs="?", default="all")
+    parser.add_argument("place", nargs="?", type=Path)
+    parser.add_argument("--seconds", type=float)
+    parser.add_argument("--count", type=int)
+    args = parser.parse_args()
+    if args.what == "child":
+        child(args.place)
+    benches = {
+        "clock": bench_clock,
+        "plans": lambda: bench_plans(args.count or 1000),
+        "tags": bench_tags,
+        "rates": lambda: bench_rates(args.seconds or 60.0),
+        "soak": lambda: bench_soak(args.seconds or 600.0),
+        "kill": lambda: bench_kill(args.count or 100),
+        "detect": lambda: bench_detect(args.count or 200),
+        "faults": bench_faults,
+    }
+    chosen = list(benches) if args.what == "all" else [args.what]
+    results = [benches[name]() for name in chosen]
+    return 0 if all(results) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
