@@ -31,7 +31,7 @@ TWICE_PX = 12.0
 
 @dataclass(frozen=True, eq=False)
 class TagSeen:
-    """One tag in one image of a toss. `time_ns` is the mid-exposure with the camera's time offset applied."""
+    """One tag in one image of a toss. `time_ns` is the mid-exposure on the D455's clock."""
 
     toss: int
     camera: str
@@ -59,14 +59,14 @@ def find_tags(
     session: Session,
     tosses: Sequence[int],
     family: str,
-    offsets_s: Mapping[str, float],
+    offset_ns: int,
     progress: Progress,
 ) -> Sightings:
-    """Detect tags in all mono images, cached beside the session. Raises BadInput where there is no image or no tag."""
+    """Detect tags in all mono images, cached beside the session. `offset_ns` is added to their stamps. Raises BadInput where there is no image or no tag."""
     frames: dict[int, dict[str, Int64[Array, " n"]]] = {}
     for number in tosses:
         toss = session.toss(number)
-        frames[number] = {name: _times_ns(toss, name, offsets_s) for name in mono_cameras(toss)}
+        frames[number] = {name: toss.mono(name).times_ns + offset_ns for name in mono_cameras(toss)}
     counts = [(toss, camera, len(times)) for toss, cameras in frames.items() for camera, times in cameras.items()]
     total = sum(n for *_, n in counts)
     if total == 0:
@@ -88,10 +88,6 @@ def find_tags(
     ]
     kept, twice = _single(seen)
     return Sightings(tuple(kept), frames, twice, len(lists.lost))
-
-
-def _times_ns(toss: Toss, camera: str, offsets_s: Mapping[str, float]) -> Int64[Array, " n"]:
-    return toss.mono(camera).times_ns + round(1e9 * offsets_s.get(camera, 0.0))
 
 
 def _images(session: Session, counts: Sequence[tuple[str | int, str, int]]) -> Iterator[UInt8[Array, "h w"]]:

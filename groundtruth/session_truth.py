@@ -8,7 +8,7 @@ import json
 import shutil
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -37,6 +37,7 @@ from recordings.progress import Progress, Silent
 from recordings.records import StampedPose
 from recordings.session import Session
 from recordings.session_writer import write_json, write_truth
+from recordings.sync import clock_offset_ns
 
 TRUTH = "truth"
 
@@ -83,7 +84,8 @@ def find_truth(
     """Detect, solve, smooth, interpolate, judge. Raises BadInput or Undetermined with what to do."""
     config, progress = config or TruthConfig(), progress or Silent()
     calibration = session.calibration
-    sightings = find_tags(session, tosses, config.family, camera_offsets_s(calibration.residuals), progress)
+    offset_ns = clock_offset_ns(calibration.residuals, "mono")
+    sightings = find_tags(session, tosses, config.family, offset_ns, progress)
     for camera in {c for cameras in sightings.frames.values() for c in cameras}:
         calibration.camera(camera)
     sightings, spread_ns = shared_times(sightings, round(config.sync_s * 1e9))
@@ -99,17 +101,10 @@ def find_truth(
     solved = _in_tagged_frame(
         solve_session(sightings, roles, sizes, calibration, config.layout, progress=progress), config
     )
+    size_notes += [f"time offset of the mono cameras applied: {offset_ns / 1e6:.2f} ms"] if offset_ns else []
     verdict = judge(solved, sightings, spread_ns, size_notes, calibration)
     truths = {toss: _at_color_frames(session, toss, solved, config) for toss in tosses}
     return SessionTruth(solved, truths, verdict, sizes)
-
-
-def camera_offsets_s(residuals: Mapping[str, Any]) -> dict[str, float]:
-    """Seconds to add to each ground-truth camera's stamps to be on the D455's clock, from calibration.json's
-    `residuals.time.offsets_s` (written by `toss-calibrate time`); none where it was not run."""
-    stored = residuals.get("time") or {}
-    offsets = stored.get("offsets_s") or {} if isinstance(stored, Mapping) else {}
-    return {str(name): float(value) for name, value in offsets.items()}
 
 
 def _sizes(
@@ -157,8 +152,6 @@ def _weighted_median(values: Float[Array, " n"], weights: Int64[Array, " n"]) ->
 
 def _in_tagged_frame(solved: Solved, config: TruthConfig) -> Solved:
     """The solution with the body's frame moved to `tagged` (a given layout's frame stays)."""
-    from dataclasses import replace
-
     if config.layout is not None:
         return solved
     old_from_new = tagged_frame(solved.layout)

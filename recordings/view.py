@@ -20,10 +20,12 @@ from recordings.session_writer import write_bytes
 from recordings.view_arm import known_arm, log_arm_model, log_arm_motion
 from recordings.view_blueprint import ABOUT, about_text, blueprint
 from recordings.view_bodies import log_bodies, log_rig
+from recordings.view_cycle import log_cycle
 from recordings.view_file import PipedFile
 from recordings.view_layers import EVENTS, TIME, Clock, Look, Steps, log_toss
 from recordings.view_scene import Scene, moment_ns, result_bodies, results_scene, session_scene
 from recordings.view_track import log_tracking
+from recordings.view_truth import log_truth
 from recordings.view_viewer import Viewer, ViewerFailed, run_rerun
 
 APPLICATION = "tosslab"
@@ -185,8 +187,10 @@ def fill(
         clear(clock.at(start_ns))
         clock.at(start_ns).log(EVENTS, rr.TextLog(f"toss {toss}: recording begins"))
         log_bodies(recording, scene, toss)
+        log_truth(clock, scene)
         for body in scene.bodies:
             log_tracking(clock, scene, body)
+            log_cycle(clock, scene, body)
         if robot is not None:
             log_arm_motion(recording, scene, robot, toss)
         log_toss(recording, scene, toss, look, steps)
