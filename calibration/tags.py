@@ -12,6 +12,7 @@ import queue
 import struct
 import subprocess
 import sys
+import zipfile
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -31,8 +32,9 @@ from recordings.errors import BadInput, TosslabError
 from recordings.progress import Progress, Silent
 from recordings.records import TagSighting
 
-FAMILY_CELLS = {"tag36h11": 8, "tag25h9": 7, "tag16h5": 6, "tagStandard41h12": 5, "tagStandard52h13": 6}
-"""Side of the square whose corners the detector gives, in cells."""
+FAMILY_CELLS = {"tag36h11": 8, "tag25h9": 7, "tag16h5": 6, "tagStandard41h12": 5}
+"""Side of the square whose corners the detector gives, in cells. (Families with tens of thousands of codes take minutes
+and gigabytes to load: they are left out.)"""
 Response = Literal["linear", "srgb"]
 Search = Literal["normal", "thorough"]
 """`thorough` looks in the image enlarged twice too: tags down to some 10 px, at five times the time."""
@@ -115,7 +117,7 @@ def detect_tags(
             done += len(chunk)
             progress.step(done, max(total or done, done), "images searched for tags")
     if lost:
-        progress.value("images lost to the tag detector", len(lost), at=done)
+        progress.value("images lost to the tag detector", float(len(lost)), at=done)
     return TagLists(lists, lost)
 
 
@@ -189,7 +191,7 @@ def _read(path: Path, images: int) -> list[list[TagDetection]] | None:
             margin = float(data["margin"][k])
             lists[image].append(TagDetection(tag_id, corners, covariance, margin, hamming, bool(refined)))
         return lists
-    except (OSError, ValueError, KeyError, IndexError, EOFError):
+    except (OSError, ValueError, KeyError, IndexError, EOFError, zipfile.BadZipFile):
         return None
 
 
