@@ -143,7 +143,8 @@ class BackgroundSegmenter:
         moved = moved_pixels(frame, self._scene, self._settings.foreground)
         stands_out = (moved & mask).sum() >= self._settings.part_of_scene * mask.sum()
         unknown = (~self._scene.known & surroundings(mask)).sum()
-        if stands_out and unknown <= self._settings.unknown * mask.sum():
+        # with a robot the scene is learned behind what it holds: what is unknown there lies behind the robot itself
+        if stands_out and (self._drawn is not None or unknown <= self._settings.unknown * mask.sum()):
             return self._scene
         return with_object_removed(self._scene, frame, mask, moved, self._camera)
 
