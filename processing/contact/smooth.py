@@ -18,6 +18,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray as Array
+from scipy import sparse
+from scipy.linalg import cho_solve_banded, cholesky_banded
 
 from processing.contact.motion import GRAVITY_M_S2, PoseSeries, States, differences, rotation_matrices, rotation_vectors
 from processing.contact.segment import Noise, Phases, find_phases, pose_noise
@@ -72,14 +74,23 @@ def _joined(phases: Phases, kind: str, n: int) -> Bool[Array, " m"]:
     return inside
 
 
-def _second_difference(time_s: Float[Array, " n"]) -> Float[Array, "m n"]:
-    """The matrix that takes positions to changes of velocity: v_{k+2} - v_{k+1}."""
+def _second_difference(time_s: Float[Array, " n"]) -> sparse.csr_array:
+    """The matrix (n - 2, n) that takes positions to changes of velocity: v_{k+2} - v_{k+1}."""
     n, dt = len(time_s), np.diff(time_s)
-    D = np.zeros((n - 2, n))
-    k = np.arange(n - 2)
-    D[k, k], D[k, k + 2] = 1 / dt[:-1], 1 / dt[1:]
-    D[k, k + 1] = -(1 / dt[:-1] + 1 / dt[1:])
-    return D
+    bands = [1 / dt[:-1], -(1 / dt[:-1] + 1 / dt[1:]), 1 / dt[1:]]
+    return sparse.csr_array(sparse.diags_array(bands, offsets=[0, 1, 2], shape=(n - 2, n)))
+
+
+def _factor(information: sparse.csr_array, width: int) -> Float[Array, "b n"]:
+    """The Cholesky factor of a matrix with `width` diagonals on either side, in LAPACK's lower banded form.
+
+    Dense algebra on matrices of this size lets BLAS start threads that cost more CPU than they save.
+    """
+    n = information.shape[0]
+    bands = np.zeros((width + 1, n))
+    for k in range(width + 1):
+        bands[k, : n - k] = information.diagonal(-k)
+    return np.asarray(cholesky_banded(bands, lower=True))
 
 
 def _smooth_position(
@@ -87,12 +98,13 @@ def _smooth_position(
 ) -> tuple[Float[Array, "n 3"], Float[Array, "n 3 3"], Float[Array, "n 3 3"]]:
     D = _second_difference(series.time_s)
     sigma = np.where(flying | resting, FLIGHT_CHANGE_M_S, TOUCH_CHANGE_M_S)
-    wanted = np.zeros((len(D), 3))
+    wanted = np.zeros((len(series) - 2, 3))
     wanted[:, 2] = np.where(flying, -GRAVITY_M_S2 * np.diff(series.time_s)[1:], 0.0)
-    W = D / sigma[:, None] ** 2
-    information = np.eye(len(series)) / noise.position_m**2 + D.T @ W
-    covariance = np.linalg.inv(information)
-    position = covariance @ (series.position_m / noise.position_m**2 + W.T @ wanted)
+    W = sparse.diags_array(1 / sigma**2) @ D
+    information = sparse.eye_array(len(series)) / noise.position_m**2 + D.T @ W
+    factor = _factor(information, 2)
+    covariance = cho_solve_banded((factor, True), np.eye(len(series)))
+    position = cho_solve_banded((factor, True), series.position_m / noise.position_m**2 + W.T @ wanted)
     variance = np.diagonal(covariance)
     speed = _speed_variance(series.time_s, variance, np.diagonal(covariance, 1))
     return position, variance[:, None, None] * np.eye(3), speed[:, None, None] * np.eye(3)
@@ -117,20 +129,21 @@ def _smooth_rotation(
     rotation, n = series.rotation.copy(), len(series)
     sigma = np.where(flying | resting, FLIGHT_CHANGE_RAD_S, TOUCH_CHANGE_RAD_S)
     dt = np.diff(series.time_s)
-    information = np.eye(3 * n)
+    factor = np.ones((1, 3 * n))
     for _ in range(ROUNDS):
         here = PoseSeries(series.toss, series.time_s, rotation, series.position_m)
         J = _spin_jacobian(rotation, dt)
         change = np.where(flying[:, None], _torque_free(here, inertia), 0.0)
         residual = (np.diff(differences(here).spin_object_rad_s[1:], axis=0) - change).ravel()
-        W = J / np.repeat(sigma, 3)[:, None] ** 2
+        W = sparse.diags_array(1 / np.repeat(sigma, 3) ** 2) @ J
         moved = rotation_vectors(np.swapaxes(series.rotation, 1, 2) @ rotation).ravel()
-        information = np.eye(3 * n) / noise.rotation_rad**2 + J.T @ W
-        step = np.linalg.solve(information, -moved / noise.rotation_rad**2 - W.T @ residual)
+        factor = _factor(sparse.eye_array(3 * n) / noise.rotation_rad**2 + J.T @ W, 8)
+        step = cho_solve_banded((factor, True), -moved / noise.rotation_rad**2 - W.T @ residual)
         rotation = rotation @ rotation_matrices(step.reshape(n, 3))
         if np.abs(step).max() < 1e-7:
             break
-    covariance = np.linalg.inv(information).reshape(n, 3, n, 3).transpose(0, 2, 1, 3)
+    inverse = cho_solve_banded((factor, True), np.eye(3 * n))
+    covariance = inverse.reshape(n, 3, n, 3).transpose(0, 2, 1, 3)
     k = np.arange(n - 1)
     own, later, cross = covariance[k, k], covariance[k + 1, k + 1], covariance[k, k + 1]
     turn = np.swapaxes(rotation[:-1], 1, 2) @ rotation[1:]
@@ -148,19 +161,18 @@ def _torque_free(series: PoseSeries, inertia: Float[Array, "3 3"]) -> Float[Arra
     return np.diff(series.time_s)[1:, None] * free
 
 
-def _spin_jacobian(rotation: Float[Array, "n 3 3"], dt: Float[Array, " m"]) -> Float[Array, "a b"]:
+def _spin_jacobian(rotation: Float[Array, "n 3 3"], dt: Float[Array, " m"]) -> sparse.csr_array:
     """d(w_{k+2} - w_{k+1}) / d(d_k, d_{k+1}, d_{k+2}): w = log(R_k' R_{k+1}) / dt moves by Jr^-1 d_{k+1} - Jl^-1
     d_k."""
     n = len(rotation)
     turn = rotation_vectors(np.swapaxes(rotation[:-1], 1, 2) @ rotation[1:])
     right = _right_jacobian_inverse(turn) / dt[:, None, None]
     left = np.swapaxes(right, 1, 2)
-    J = np.zeros((n - 2, 3, n, 3))
     k = np.arange(n - 2)
-    J[k, :, k] = left[:-1]
-    J[k, :, k + 1] = -right[:-1] - left[1:]
-    J[k, :, k + 2] = right[1:]
-    return J.reshape(3 * (n - 2), 3 * n)
+    blocks = np.stack([left[:-1], -right[:-1] - left[1:], right[1:]], 1).reshape(-1, 3, 3)
+    columns = np.stack([k, k + 1, k + 2], 1).ravel()
+    ends = 3 * np.arange(n - 1)
+    return sparse.csr_array(sparse.bsr_array((blocks, columns, ends), shape=(3 * (n - 2), 3 * n)))
 
 
 def _right_jacobian_inverse(vectors: Float[Array, "n 3"]) -> Float[Array, "n 3 3"]:

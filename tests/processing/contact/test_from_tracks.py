@@ -242,7 +242,7 @@ def test_figure_4_learns_on_all_but_the_last_and_counts_tosses_per_step(figure, 
     assert judged.truth.errors.tosses == (0, 1)
     assert judged.truth.left_out[2] == "no true poses"
     gap = judged.truth.errors.position_m[0] - figure.estimated.errors.position_m[0]
-    assert np.nanmax(np.abs(gap)) < 0.006
+    assert np.nanmean(np.abs(gap)) < 0.003  # the track is 30 Hz, straight between its frames
     assert judged.truth.position.count[-1] == 2  # the truth of the second toss goes on where its track ends
     with pytest.raises(BadInput, match="none of the tosses"):
         against_truth(figure, {})

@@ -20,7 +20,7 @@ from processing.contact.weights import Candidate, choose
 from recordings.errors import BadInput
 from recordings.tracks import ObjectShape
 
-QUICK = ContactConfig(weights=Weights(dissipation=10.0), bootstrap_repeats=4)
+QUICK = ContactConfig(weights=Weights(dissipation=10.0), bootstrap_repeats=2)
 TRUE_EDGES_M = np.array([0.1, 0.08, 0.06])
 
 
@@ -46,6 +46,7 @@ def test_a_box_is_learned_from_a_wrong_start(simulated_tosses, box_physics):
     assert done.position.mean < 0.004
 
 
+@pytest.mark.slow
 def test_mass_makes_no_difference(simulated_tosses, box_physics):
     heavy = known_physics(10 * box_physics.mass_kg, 10 * box_physics.inertia_kgm2)
     tracks = simulated_tosses(3)
@@ -55,6 +56,7 @@ def test_mass_makes_no_difference(simulated_tosses, box_physics):
     np.testing.assert_allclose(other.model.inertia_kgm2, 10 * one.model.inertia_kgm2, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_raised_and_tilted_plane_is_the_same_lab(simulated_tosses, box_physics):
     turn = rotation_matrices(np.array([0.1, -0.2, 0.0]))
     tracks = simulated_tosses(3)
@@ -170,6 +172,7 @@ def test_the_weight_lies_between_the_best_and_the_largest_within_one_standard_er
     assert choose([best, close, far]) is close
 
 
+@pytest.mark.slow
 def test_inertia_and_center_are_learned_when_asked(simulated_tosses, box_physics):
     wrong = known_physics(box_physics.mass_kg, 1.3 * box_physics.inertia_kgm2)
     config = replace(QUICK, fit=FitConfig(learn_inertia=True, learn_center=True), bootstrap_repeats=2)
