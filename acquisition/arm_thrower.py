@@ -138,7 +138,7 @@ def onset_s(widths: Sequence[tuple[float, float]]) -> float | None:
     k = int(moving[0])
     if k + 1 < len(width) and width[k + 1] > width[k]:
         speed = (width[k + 1] - width[k]) / (times[k + 1] - times[k])
-        return float(max(times[k] - (width[k] - width[0]) / speed, times[max(k - 1, 0)]))
+        return float(max(times[k] - (width[k] - width[0]) / speed, times[max(k - 2, 0)]))
     return float(0.5 * (times[k] + times[max(k - 1, 0)]))
 
 

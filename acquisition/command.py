@@ -62,7 +62,9 @@ def _record(
     clock = new_clock(out)
     recorder = Recorder(setup.rig, setup.devices, clock)
     with contextlib.ExitStack() as open_things:
-        if setup.lab is not None:
+        if setup.lab is not None and args.calibration:
+            setup.lab.stage.set_up(setup.lab.show.board_views(progress_for("preparing the simulated lab")))
+        elif setup.lab is not None:
             setup.thrower.prepare(first, 0, progress_for("preparing the simulated lab"))
         open_things.enter_context(recorder)
         if args.preview:
@@ -240,12 +242,21 @@ def start_document(
             "devices": described,
         },
         "preflight": [asdict(row) for row in checks.rows],
+        **_board(args, setup),
         "versions": {
             "tosslab": metadata.version("tosslab"),
             "python": platform.python_version(),
             "system": platform.platform(),
         },
     }
+
+
+def _board(args: argparse.Namespace, setup: Setup) -> dict[str, Any]:
+    if not args.calibration:
+        return {}
+    from acquisition.views import board_document
+
+    return {"board": board_document(setup)}
 
 
 def outcome(report: SessionReport, checks: Preflight) -> Outcome:
@@ -279,9 +290,10 @@ def outcome(report: SessionReport, checks: Preflight) -> Outcome:
         ],
     }
     lines = [f"{toss_name(t.toss)}  {t.decision:<7} {t.seconds:5.1f} s  {t.bytes / 1e6:6.1f} MB" for t in report.takes]
-    lines.append(f"{report.accepted} of {report.asked} tosses are in {report.folder}")
+    if report.asked:
+        lines.append(f"{report.accepted} of {report.asked} tosses are in {report.folder}")
     if report.stopped:
         lines.append(f"stopped: {report.stopped}")
     lines.append(f"next: toss-session verify {report.folder}")
-    good = report.accepted >= report.asked
+    good = report.accepted >= report.asked and not (report.asked == 0 and report.stopped)
     return Outcome(document, "\n".join(lines), DONE if good else FELL_SHORT)

@@ -108,6 +108,8 @@ class Rig:
     recording: RecordingConfig = field(default_factory=RecordingConfig)
     toss: TossConfig | None = None
     """None: tossed by hand."""
+    board: Mapping[str, Any] = field(default_factory=dict)
+    """The calibration board: kind = "charuco", "chessboard" or "tags" with its sizes; empty: tosslab's own tags."""
     simulation: Mapping[str, Any] = field(default_factory=dict)
     """For the drivers `synthetic` and `replay`."""
 

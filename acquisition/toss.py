@@ -104,10 +104,10 @@ class Breach:
     unit: str
 
     def __str__(self) -> str:
-        return (
-            f"{self.what} of {self.part} at {self.time_s:.3f} s: {self.value:.4g} {self.unit}, "
-            f"allowed are {self.limit:.4g} ({SHARE:g} of the limit)"
-        )
+        where = f"{self.what} of {self.part} at {self.time_s:.3f} s: {self.value:.4g} {self.unit}"
+        if self.what in ("distance", "height"):
+            return f"{where}, at least {self.limit:.4g} is wanted"
+        return f"{where}, allowed are {self.limit:.4g} ({SHARE:g} of the limit)"
 
 
 def draw_target(config: TossConfig, toss: int, attempt: int = 0) -> TossTarget:

@@ -6,7 +6,7 @@ With `pictures = "pool"` nothing is rendered: noisy pictures of the right size i
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -17,8 +17,9 @@ from numpy import ndarray as Array
 
 from acquisition.devices import JointTrajectory
 from acquisition.synthetic.arm import FORWARD_S, OPEN_M, READY_RAD, Swing
+from acquisition.synthetic.board import board_pose
 from acquisition.synthetic.cameras import MONO_NAMES
-from acquisition.synthetic.chance import generator
+from acquisition.synthetic.chance import BOARD, generator
 from acquisition.synthetic.config import (
     ArmConfig,
     CameraConfig,
@@ -44,8 +45,9 @@ if TYPE_CHECKING:
 GRIPPER = 80
 STILL_RAYS = 700_000
 POOL = 6
+VIEW_S = 3.0
+"""How long the board is held in one place."""
 SAMPLES_HZ = 1000
-NOT_RENDERED = "a pool of pictures shows no toss"
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,6 +192,23 @@ class Show:
         )
         return self.lab.planner.follow(toss, swing)
 
+    def board_views(self, progress: Progress) -> Performance:
+        """The calibration board, held still in one place after the other, seen by all cameras."""
+        rng, count = generator(self.config.seed, BOARD), self.config.board_views
+        pictures: dict[str, list[Array]] = {name: [] for name in self.phases_s()}
+        frames = round(VIEW_S * self.config.fps)
+        for number in range(count):
+            color, depth, monos = self.lab.board_view(number, board_pose(rng))
+            shown = {"d455/color": color, "d455/depth": depth, **dict(zip(MONO_NAMES, monos))}
+            for name, reel in pictures.items():
+                reel += [_stirred(shown[name], k) for k in range(2)] * (frames // 2)
+            progress.step(number + 1, count, "views of the board")
+        motion = _still_motion(np.stack([READY_RAD, READY_RAD]))
+        times_s = np.arange(len(pictures["d455/color"])) / self.config.fps
+        phases_s = self.phases_s()
+        reels = {n: Reel(times_s + phases_s[n], p, p[:2], p[-2:]) for n, p in pictures.items()}
+        return Performance(motion, reels)
+
     def is_of(self, performance: Performance, trajectory: JointTrajectory) -> bool:
         """Whether a performance was made for this trajectory."""
         swing = performance.motion.swing
@@ -228,10 +247,19 @@ def _standing_plan(delay_s: float) -> TossPlan:
     return TossPlan(stand, 1.0, 1.0 - delay_s, tool, np.zeros(3), np.zeros(3))
 
 
-def _pool(config: SyntheticConfig, trajectory: JointTrajectory, phases_s: dict[str, float]) -> Performance:
-    rng = generator(config.seed, 81)
-    q = trajectory.q_rad[0]
-    swing = CommandedSwing(1.0, q, np.zeros(7), np.zeros(7), FORWARD_S, 0.04, 0.05, trajectory)
+def _stirred(picture: Array, variant: int) -> Array:
+    """The same picture, one grey level off in a few pixels: no camera sends the same one twice."""
+    if variant == 0:
+        return picture
+    other = picture.copy()
+    other[::16, ::16] ^= 1
+    return other
+
+
+def _still_motion(q: Float[Array, "2 j"]) -> Motion:
+    """Nothing moves."""
+    stand = JointTrajectory(np.array([0.0, 2.0]), q, np.zeros_like(q))
+    swing = CommandedSwing(1.0, q[0], np.zeros(7), np.zeros(7), FORWARD_S, 0.04, 0.05, stand)
     still = Trajectory(
         np.array([0.0, 1.0]),
         np.zeros((2, 3)),
@@ -239,7 +267,14 @@ def _pool(config: SyntheticConfig, trajectory: JointTrajectory, phases_s: dict[s
         np.zeros((2, 3)),
         np.zeros((2, 3)),
     )
-    motion = Motion(0, still, Instants(0.0, 1.0, 1.3, 1.6, 2.0), 1.04, swing)
+    return Motion(0, still, Instants(0.0, 1.0, 1.3, 1.6, 2.0), 1.04, swing)
+
+
+def _pool(config: SyntheticConfig, trajectory: JointTrajectory, phases_s: dict[str, float]) -> Performance:
+    rng = generator(config.seed, 81)
+    motion = _still_motion(trajectory.q_rad[[0, -1]])
+    assert isinstance(motion.swing, CommandedSwing)
+    motion = replace(motion, swing=replace(motion.swing, trajectory=trajectory))
     reels = {}
     for name in phases_s:
         size = config.mono_size if name.startswith("mono") else config.color_size

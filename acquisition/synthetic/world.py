@@ -59,6 +59,15 @@ class Stage:
             self._next = None
             return self.grid_ns(first)
 
+    def over(self) -> bool:
+        """Whether the last performance has been played to its end."""
+        with self._lock:
+            if not self.shown:
+                return False
+            last = self.shown[-1]
+            count = max((len(reel.times_s) for reel in last.performance.reels.values()), default=0)
+            return self.frame_before(time.monotonic_ns()) > last.first_frame + count
+
     @property
     def ready(self) -> Performance | None:
         return self._next

@@ -28,7 +28,7 @@ from recordings.tracks import RigCalibration
 
 BASE = Transform("world", "base", rotation_exp(np.array([0.0, 0.0, -np.pi / 2])), np.array([0.0, 0.6, 0.0]))
 CALM = TossConfig(
-    position_m=(0.0, 0.1, 0.35), velocity_m_s=(0.1, -0.5, 0.4), position_spread_m=0.02, velocity_spread_m_s=0.1
+    position_m=(0.0, 0.1, 0.35), velocity_m_s=(0.05, -0.35, 0.3), position_spread_m=0.02, velocity_spread_m_s=0.05
 )
 DELAY = ReleaseDelay(0.06, 0.01)
 ARMS = ("panda", "ur5e")
@@ -80,7 +80,7 @@ def test_a_planned_toss_passes_its_release_with_its_velocity_and_keeps_it(model:
     assert plan.window_s >= 4 * DELAY.sigma_s
     assert plan.release_s - plan.command_s == pytest.approx(DELAY.mean_s)
     for early in (-0.5, 0.5):
-        np.testing.assert_allclose(plan.trajectory.at(plan.release_s + early * 0.98 * plan.window_s)[1], dq, atol=1e-6)
+        np.testing.assert_allclose(plan.trajectory.at(plan.release_s + early * 0.98 * plan.window_s)[1], dq, atol=1e-4)
 
 
 @pytest.mark.parametrize("name", ARMS)
@@ -110,7 +110,7 @@ def test_every_accepted_plan_stays_within_the_limits(name: str) -> None:
             r"velocity of panda_joint\d at .* rad/s, allowed are .* \(0.9 of the limit\)",
         ),
         ({"position_m": (0.0, -2.0, 0.3)}, "no joint angles of the panda reach the release pose"),
-        ({"position_m": (0.0, 0.1, 0.03)}, "height of panda_.* m over the table"),
+        ({"position_m": (0.0, 0.1, 0.03)}, "(height|distance) of panda_.* at least .* is wanted"),
     ],
 )
 def test_a_toss_that_cannot_be_is_refused_with_what_stands_in_the_way(change: dict, says: str) -> None:

@@ -1,0 +1,40 @@
+"""The live preview, headless: what is logged arrives in the viewer."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from acquisition.clock import SessionClock
+from acquisition.drivers.synthetic import SyntheticConfig, SyntheticLab, SyntheticThrower
+from acquisition.preview import Preview
+from acquisition.recorder import Recorder
+from acquisition.rig import DeviceEntry, Rig
+from recordings.progress import Silent
+from recordings.view_live import LiveView
+from recordings.view_viewer import ViewerFailed
+
+
+@pytest.mark.slow
+def test_a_picture_of_every_stream_is_in_the_viewer(record: Callable[..., Any]) -> None:
+    lab = SyntheticLab(SyntheticConfig(pictures="pool", color_size=(212, 120), mono_size=(160, 120), mono_cameras=1))
+    SyntheticThrower(lab).prepare(0, 0, Silent())
+    entries = (DeviceEntry("d455", "rgbd", "synthetic"), DeviceEntry("mono0", "mono", "synthetic"))
+    devices = {e.name: lab.device(e.name, e.kind) for e in entries}
+    recorder = Recorder(Rig("r", entries, Path("r.toml")), devices, SessionClock(time.monotonic_ns(), time.time_ns()))
+    with recorder, Preview(recorder, headless=True) as preview:
+        time.sleep(2.0)
+        picture = preview.view.picture()
+    assert picture.startswith(b"\x89PNG")
+    assert len(picture) > 20_000  # an empty window is smaller
+
+
+def test_without_a_display_the_preview_says_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    with pytest.raises(ViewerFailed, match="leave it out"):
+        LiveView()
