@@ -21,8 +21,8 @@ from calibration.poses import exp_poses
 from recordings.geometry import CameraModel
 
 POSE = 6
-STEPS = 60
-SMALL_GAIN = 1e-9
+STEPS = 40
+SMALL_GAIN = 1e-6
 STEP_PX = 1e-4
 BEHIND_PX = 1e4
 """Residual of a point that came to lie behind its camera."""

@@ -158,12 +158,12 @@ def target_from_document(document: Mapping[str, Any], where: str) -> Target:
                 {int(t["id"]): float(t["size_m"]) for t in tags},
                 {int(t["id"]): np.array(t["T_board_tag"], dtype=np.float64) for t in tags},
             )
+        if kind not in ("charuco", "chessboard"):
+            raise BadInput(f"{where}: a calibration board of kind {kind!r}; wanted tags, charuco or chessboard")
         sizes = (int(document["columns"]), int(document["rows"]), float(document["square_m"]))
         if kind == "charuco":
             dictionary = str(document.get("dictionary", "DICT_5X5_100"))
             return Charuco(*sizes, float(document["marker_m"]), dictionary, bool(document.get("legacy", False)))
-        if kind == "chessboard":
-            return Chessboard(*sizes)
+        return Chessboard(*sizes)
     except (KeyError, TypeError, ValueError) as wrong:
         raise BadInput(f"{where}: the calibration board: {type(wrong).__name__} {wrong}; see README.md") from wrong
-    raise BadInput(f"{where}: a calibration board of kind {kind!r}; wanted tags, charuco or chessboard")
