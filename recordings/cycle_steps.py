@@ -90,11 +90,18 @@ class TossCycle:
     steps: tuple[Step, ...]
     rollout: Rollout | None
 
+    @property
+    def tells_something(self) -> bool:
+        """More than the result itself."""
+        first = self.steps[0]
+        return len(self.steps) > 1 or bool(first.learned or first.judged or self.rollout)
+
 
 def read_cycle(results: Results, record: VariantRecord) -> dict[int, TossCycle]:
     """Of each toss of a variant what is known of its passes. Raises DamagedFile for files that cannot be read."""
     reader = _Reader(results, record)
-    return {t.toss: reader.toss(t.toss, t.track, t.shape or record.shape) for t in record.tosses}
+    found = {t.toss: reader.toss(t.toss, t.track, t.shape or record.shape) for t in record.tosses}
+    return {t: cycle for t, cycle in found.items() if cycle.tells_something}
 
 
 class _Reader:

@@ -10,6 +10,7 @@ from numpy import ndarray as Array
 
 from recordings.view_arm import BASE
 from recordings.view_bodies import BODY, PATH
+from recordings.view_cycle import cycle_plots, cycle_words, hidden_entities, step_views
 from recordings.view_layers import ARM, DEPTH, EVENTS, FRAMES, HEALTH, MOTION, TIME, Clock, image_entity
 from recordings.view_scene import Body, Scene, root_poses
 from recordings.view_track import FIGURES, MATCHES, MODEL
@@ -65,12 +66,12 @@ def _spaces(scene: Scene) -> rrb.Container:
         for body in scene.bodies
         if body.shown and body.notes
     ]
-    return rrb.Tabs(_space(scene), *model, active_tab=0)
+    return rrb.Tabs(_space(scene), *model, *step_views(scene), active_tab=0)
 
 
 def _space(scene: Scene) -> rrb.Spatial3DView:
     hidden = [body for body in scene.bodies if not body.shown]
-    paths = [e.format(body.name) for body in hidden for e in (BODY, PATH)]
+    paths = [*(e.format(body.name) for body in hidden for e in (BODY, PATH)), *hidden_entities(scene)]
     overrides = {path: rrb.EntityBehavior(visible=False) for path in paths}
     if scene.root != "world":
         return rrb.Spatial3DView(origin="world", name=f"As seen from {scene.root}", overrides=overrides)
@@ -164,6 +165,7 @@ def _plots(scene: Scene) -> rrb.Container | None:
     for name, shown in FIGURE_NAMES.items():
         if any(has_figure(body, name) for body in scene.bodies):
             plots.append((f"{FIGURES}/{name}", shown))
+    plots += cycle_plots(scene)
     if any("/arm/joint_states" in toss.file.channels for toss in recorded):
         plots += [(f"{ARM}/angles_rad", "Arm joints (rad)"), (f"{ARM}/speeds_rad_s", "Joint speeds (rad/s)")]
         plots.append((f"{ARM}/finger_width_m", "Gripper (m)"))
@@ -209,6 +211,8 @@ def about_text(scene: Scene) -> str:
         hidden = "" if body.shown else " (hidden: click its eye in the list of entities)"
         lines += [f"- **{_color_word(body.color)}**: {body.label}, and its way through the toss{hidden}."]
         lines += _tracking_words(body)
+    for body in scene.bodies:
+        lines += cycle_words(body)
     lines += [
         "",
         "Space starts and stops. The blue range of the time line is the first toss; drag it to another.",

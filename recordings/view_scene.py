@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int64
 from numpy import ndarray as Array
 
+from recordings.cycle_steps import TossCycle, read_cycle
 from recordings.errors import BadInput
 from recordings.geometry import Transform
 from recordings.records import StampedPose
@@ -47,6 +48,8 @@ class Body:
     """Of each toss, where the body was tracked in masks."""
     notes: Mapping[int, TrackNotes] = field(default_factory=dict)
     """How it was tracked, where the tracker kept that."""
+    cycle: Mapping[int, TossCycle] = field(default_factory=dict)
+    """The passes that led to it, where its results folder still holds them."""
 
     def shape(self, toss: int) -> ObjectShape | None:
         return self.shapes.get(toss)
@@ -135,7 +138,8 @@ def _result_body(results: Results, record: VariantRecord, rank: int) -> Body:
         return Body(name, label, color, poses, shapes, shown=False)
     masks = {t.toss: read_masks(results.path / t.masks, t.toss) for t in record.tosses if t.masks}
     found = {t.toss: find_notes(results, t.track, t.toss) for t in record.tosses}
-    return Body(name, label, color, poses, shapes, True, masks, {t: n for t, n in found.items() if n is not None})
+    notes = {t: n for t, n in found.items() if n is not None}
+    return Body(name, label, color, poses, shapes, True, masks, notes, read_cycle(results, record))
 
 
 def bodies_scene(name: str, calibration: RigCalibration, bodies: Sequence[Body]) -> Scene:
