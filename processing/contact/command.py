@@ -171,7 +171,7 @@ def _truth_poses(session: Session, tosses: Sequence[int], given: Path | None, vi
     name = "truth (only because --poses truth asks for it)"
     if vision is None or vision.shape is None:
         return PoseSource(f"{name}; the origin of its object frame is taken for the centre of mass", tracks, None)
-    return PoseSource(name, tracks, _in_frame_of(tracks, vision))
+    return PoseSource(name, tracks, in_frame_of(tracks, vision))
 
 
 def _true_series(truth: Truth, session: Session, toss: int) -> PoseSeries | None:
@@ -188,7 +188,7 @@ def _true_series(truth: Truth, session: Session, toss: int) -> PoseSeries | None
     return None if poses is None else PoseSeries.from_camera(toss, empty.time_ns, poses, CAMERA, session.calibration)
 
 
-def _in_frame_of(tracks: Sequence[PoseSeries], vision: PoseSource) -> ObjectShape:
+def in_frame_of(tracks: Sequence[PoseSeries], vision: PoseSource) -> ObjectShape:
     """Vision's shape in the truth's object frame: the median of truth_from_track over all frames that both have."""
     import numpy as np
     from scipy.spatial.transform import Rotation

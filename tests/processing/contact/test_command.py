@@ -1,18 +1,22 @@
 import json
 import xml.etree.ElementTree as ET
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
-from processing.contact.command import chosen, contact_only, find_poses
+from processing.contact.command import PoseSource, chosen, contact_only, find_poses, in_frame_of
+from processing.contact.geometry import CORNERS
+from processing.contact.motion import rotation_matrices
 from recordings.errors import BadInput
 from recordings.geometry import Transform
 from recordings.records import StampedPose
 from recordings.results import Results
 from recordings.session import Session
 from recordings.session_writer import SessionWriter
-from recordings.tracks import RigCalibration
+from recordings.tracks import ObjectShape, RigCalibration
 
 KEYS = {"edges_m", "friction", "rollout", "ground_plane_sensitivity", "seconds", "cpu_seconds", "cpu_seconds_total",
         "transitions", "solver_failures", "untouched_vertices"}  # fmt: skip
@@ -53,6 +57,10 @@ def test_a_poses_only_session_is_learned_from_and_all_files_are_written(poses_se
     assert Path(files["plot"]).read_bytes()[:4] == b"\x89PNG"
     for path in files["assets"].values():
         ET.parse(path)
+    with np.load(Path(files["folder"]) / "rollouts.npz", allow_pickle=False) as kept:
+        assert kept["toss"].tolist() == [9]
+        assert kept["toss_09.world_from_object"].shape == (51, 4, 4)
+        np.testing.assert_allclose(np.diff(kept["toss_09.time_s"]), 1 / 148)
     results = Results.open(tmp_path / "out")
     assert results.contact("contact-only").friction == pytest.approx(document["friction"]["value"])
     assert results.shape("contact-only").source == "contact"
@@ -83,6 +91,29 @@ def test_the_imported_poses_are_the_track(poses_session, tmp_path):
 def test_bad_arguments_say_what_was_wanted(poses_session, tmp_path, options, words):
     with pytest.raises(BadInput, match=words):
         contact_only(poses_session, tmp_path / "out", **options)
+
+
+def test_cuda_is_refused_where_there_is_none(poses_session, tmp_path):
+    if torch.cuda.is_available():
+        pytest.skip("there is a CUDA device")
+    with pytest.raises(BadInput, match="finds no CUDA device"):
+        contact_only(poses_session, tmp_path / "out", device="cuda")
+
+
+def test_visions_shape_is_brought_into_the_frame_of_the_truth(simulated_tosses):
+    """The tracker's object frame is another one than the truth's: a constant turn and shift on the object's side."""
+    turn, shift = rotation_matrices(np.array([[0.3, -0.2, 1.0]]))[0], np.array([0.02, -0.01, 0.03])
+    true = simulated_tosses(2)
+    tracks = [
+        replace(t, rotation=t.rotation @ turn, position_m=t.position_m + t.rotation @ shift).part(slice(0, None, 5))
+        for t in true
+    ]
+    corners = CORNERS * [0.05, 0.04, 0.03]
+    seen = ObjectShape("tracker", "field", (corners - shift) @ turn, np.array([[0, 1, 2]]))
+    moved = in_frame_of(true, PoseSource("track", tracks, seen))
+    np.testing.assert_allclose(moved.vertices_m, corners, atol=1e-9)
+    with pytest.raises(BadInput, match="no frame has both"):
+        in_frame_of(true, PoseSource("track", [], seen))
 
 
 def test_ranges_take_the_tosses_that_exist():
