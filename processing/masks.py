@@ -89,6 +89,8 @@ def object_masks(run: Run, toss: int, scene: Done) -> Done:
         progress = run.progress(f"toss {toss}: masks")
         found = sorted(segmenter.masks(frames, given, example, robot, progress), key=lambda m: m.position)
         write_masks(folder, toss, [m.mask for m in found], np.array([m.confidence for m in found]))
+        if drawn is not None:
+            drawn.write(folder / f"{name}.robot")
         empty = sum(not m.mask.any() for m in found)
         return {
             "frames": len(found),

@@ -9,11 +9,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Bool, Float, Float32, UInt8
 from numpy import ndarray as Array
 
 from processing.segment.foreground import kernel
@@ -22,7 +23,7 @@ from processing.segment.robot_view import RobotView
 from processing.segment.static_scene import StaticScene, stereo_sigma_m
 from recordings.geometry import Transform
 from recordings.records import RgbdFrame
-from recordings.robot import PANDA_TOOL, ArmPath
+from recordings.robot import ArmPath
 
 FINGERS = ("panda_leftfinger", "panda_rightfinger")
 SAME_TIME_NS = 500_000
@@ -75,6 +76,7 @@ class RobotFrames(Sequence[Bool[Array, "h w"]]):
         self._scale = depth_scale
         self.settings = settings or RobotSettings()
         self._last: tuple[int, RobotSeen | None] = (-1, None)
+        self._kept: dict[int, UInt8[Array, " b"]] = {}
 
     def __len__(self) -> int:
         return len(self._frames)
@@ -89,11 +91,17 @@ class RobotFrames(Sequence[Bool[Array, "h w"]]):
         """The robot in a frame; None where its joints are not known at that time."""
         if self._last[0] != position:
             self._last = (position, self._draw(frame))
+            if (drawn := self._last[1]) is not None:
+                self._kept[position] = np.packbits(drawn.certain)
         return self._last[1]
 
-    def tool_px(self, time_ns: int, camera: Any) -> Float[Array, "2"]:
-        """Where the tool (the point between the finger tips) is in the image."""
-        return camera.project(self._links(time_ns, 0.0)[PANDA_TOOL].translation_m[None])[0]
+    def write(self, folder: Path) -> None:
+        """The `certain` pixels of every frame that was looked at, as PNG by position (0 or 255), for the viewer."""
+        folder.mkdir(parents=True, exist_ok=True)
+        height, width = self._view.rays.shape[:2]
+        for position, bits in self._kept.items():
+            mask = np.unpackbits(bits, count=height * width).reshape(height, width) * np.uint8(255)
+            cv2.imwrite(str(folder / f"{position:06d}.png"), mask, [cv2.IMWRITE_PNG_COMPRESSION, 1])
 
     @cached_property
     def shares(self) -> Float[Array, " b"]:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
 
+import cv2
 import numpy as np
 import pytest
 
@@ -145,7 +147,7 @@ def test_sights_are_spread_and_fast_and_known() -> None:
     assert {(0, 0), (0, 19), (0, 18), (0, 17)} <= set(chosen)
 
 
-def test_an_object_before_the_robot_keeps_its_pixels(view: RobotView, wall: StaticScene) -> None:
+def test_an_object_before_the_robot_keeps_its_pixels(view: RobotView, wall: StaticScene, tmp_path: Path) -> None:
     frame = drawn_frame(view, wall, 5)
     box = _inside_robot(frame)
     depth = frame.depth_m.copy()
@@ -158,6 +160,9 @@ def test_an_object_before_the_robot_keeps_its_pixels(view: RobotView, wall: Stat
     assert on_robot.sum() > 100
     assert not robot[0][box].any()
     assert seen.certain.sum() > 0.9 * ((seen.at_color_m > 0).sum() - on_robot.sum())
+    robot.write(tmp_path)
+    stored = cv2.imread(str(tmp_path / "000000.png"), cv2.IMREAD_GRAYSCALE)
+    np.testing.assert_array_equal(stored > 0, seen.certain)
     together = with_robot(wall, frame, seen, RobotSettings())
     nearer = (together.depth_m - frame.depth_m > 0.03)[box]
     assert nearer[on_robot].all()
@@ -247,9 +252,6 @@ def test_without_joint_states_the_masks_are_as_before_and_the_counts_say_so(
 
 def test_a_recorded_robot_is_drawn_to_the_pixel(data: Callable[[str], Path]) -> None:
     """lab_dev's true robot masks; calibration and clock are exact there."""
-    cv2 = pytest.importorskip("cv2")
-    import json
-
     folder, truth = data("lab_dev"), data("lab_dev_truth")
     said = json.loads((folder / "session.json").read_text())
     camera = CameraModel(
