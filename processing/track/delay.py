@@ -41,10 +41,24 @@ def _at_depth_time(
     for x, y in ((before, after), side):
         centers = [poses[z][:3, :3] @ scene.center_m + poses[z][:3, 3] for z in (x, y)]
         speeds.append((centers[1] - centers[0]) / (t[y] - t[x]))
-    x, y = side if np.linalg.norm(speeds[0] - speeds[1]) > IMPACT_M_S else (before, after)
+    hit = bool(np.linalg.norm(speeds[0] - speeds[1]) > IMPACT_M_S) or before == i or after == i
+    x, y = side if hit else (before, after)
     share = delay_s / (t[y] - t[x])
     step = between(poses[x], poses[y], abs(float(share)), scene.center_m) @ k.inverse(poses[x])  # camera axes
-    return _carried(poses[i], step if share > 0 else k.inverse(step), poses[x], poses[y], float(share), scene.center_m)
+    turn = step if share > 0 else k.inverse(step)
+    out = _carried(poses[i], turn, poses[x], poses[y], float(share), scene.center_m)
+    if not hit and _falls(scene, poses, (int(before), int(i), int(after))):
+        out[:3, 3] += 0.5 * scene.gravity_camera_m_s2 * delay_s**2
+    return out
+
+
+def _falls(scene: Scene, poses: Float[Array, "n 4 4"], three: tuple[int, int, int]) -> bool:
+    """Whether the body's middle accelerates by most of gravity over three views."""
+    x0, x1, x2 = (poses[z][:3, :3] @ scene.center_m + poses[z][:3, 3] for z in three)
+    first_s, second_s = np.diff(scene.times_s[list(three)])
+    change = 2 * ((x2 - x1) / second_s - (x1 - x0) / first_s) / (first_s + second_s)
+    gravity = scene.gravity_camera_m_s2
+    return bool(change @ gravity > 0.6 * float(gravity @ gravity) > 0)
 
 
 def _carried(

@@ -47,12 +47,24 @@ def settled(scene: Scene, stories: list[Hypothesis], first: int, keep_first: boo
     n = len(scene.times_s)
     apart = max((apart_deg(stories[0].poses[:n], s.poses[:n]) for s in stories[1:]), default=0.0)
     if apart < config.agreeing_deg:
-        return [refined(scene, stories[0], first, keep_first, config)]
+        return _again([refined(scene, stories[0], first, keep_first, config)], scene, first, keep_first, config)
     steady = replace(config, graph=config.steady)
     out = sorted((refined(scene, s, first, keep_first, config) for s in stories), key=lambda s: s.badness)
     smooth = refined(scene, replace(out[0].told, poses=out[0].joint.poses), first, keep_first, steady)
     out.append(refined(scene, replace(smooth.told, poses=smooth.joint.poses), first, keep_first, config))
-    return sorted(out, key=lambda s: s.badness)
+    return _again(sorted(out, key=lambda s: s.badness), scene, first, keep_first, config)
+
+
+def _again(stories: list[Story], scene: Scene, first: int, keep_first: bool, config: StoryConfig) -> list[Story]:
+    """The best story once more where depth and colour differ in time: its motion is known better now."""
+    if not _delayed(scene):
+        return stories
+    best = replace(stories[0].told, poses=stories[0].joint.poses)
+    return [refined(scene, best, first, keep_first, config), *stories[1:]]
+
+
+def _delayed(scene: Scene) -> bool:
+    return any(c is not None and abs(c.depth_delay_s) > LEAST_DELAY_S for c in scene.store.crops)
 
 
 def apart_deg(one: Float[Array, "n 4 4"], other: Float[Array, "n 4 4"]) -> float:
@@ -63,7 +75,7 @@ def apart_deg(one: Float[Array, "n 4 4"], other: Float[Array, "n 4 4"]) -> float
 
 
 def refined(scene: Scene, best: Hypothesis, first: int, keep_first: bool, config: StoryConfig) -> Story:
-    """Joint refinement of all tracked views, once more where depth and colour differ in time."""
+    """Joint refinement of all tracked views, depth moved to colour's exposure by the story's own motion."""
     n, all_views = len(scene.times_s), len(scene.store)
     use = np.isfinite(best.poses[:n, 0, 0])
     fixed = np.arange(all_views) >= n
@@ -74,14 +86,11 @@ def refined(scene: Scene, best: Hypothesis, first: int, keep_first: bool, config
     whose = np.maximum(np.arange(all_views) - n + 1, 0)  # a model's views follow each other in no time
     times_s = np.concatenate([scene.times_s, np.zeros(all_views - n)])
     drawn = np.array([scene.store.usable(i) for i in range(n, all_views)], dtype=bool)
-    delayed = any(c is not None and abs(c.depth_delay_s) > LEAST_DELAY_S for c in scene.store.crops)
-    for _ in range(2 if delayed else 1):
-        if delayed:
-            use = use & put_at_color_times(scene, poses[:n], use)
-        center_m = center_of_mass(poses[:n], use, scene)
-        motion = Motion(times_s, whose, scene.gravity_camera_m_s2, center_m, still)
-        joint = refine(scene.store, poses, np.concatenate([use, drawn]), fixed, motion, config.graph)
-        poses = joint.poses
+    if _delayed(scene):
+        use = use & put_at_color_times(scene, poses[:n], use)
+    center_m = center_of_mass(poses[:n], use, scene)
+    motion = Motion(times_s, whose, scene.gravity_camera_m_s2, center_m, still)
+    joint = refine(scene.store, poses, np.concatenate([use, drawn]), fixed, motion, config.graph)
     fit = np.nanmean(per_view(joint.pairs, joint.figures, all_views)[0][:n]) if len(joint.pairs) else 0.0
     price = mean_price(joint.poses[:n], use, scene, center_m, config.motion)
     return Story(best, use, fixed, joint, center_m, motion, float(fit + price))
