@@ -33,7 +33,6 @@ from recordings.tracks import RigCalibration
 POLL_S = 0.02
 SLOW_S = 2.0
 PLAYED = "end of the recording"
-STOPS_SESSION = ("user_stopped",)
 ENDS_TAKE = ("lost", "silent", "reflex", "user_stopped", "error", "disk", "fault", "motion")
 
 
@@ -103,7 +102,7 @@ class SessionRun:
     def record(self, options: Options) -> SessionReport:
         """All tosses that were asked for; ends early by the disk, the emergency stop or `quit`."""
         report = SessionReport(self.session.folder, options.tosses)
-        attempt, toss = 0, options.first_toss
+        attempt, rejected, toss = 0, 0, options.first_toss
         while toss < options.first_toss + options.tosses and not report.stopped:
             check_disk(self.session.folder, self._rate_bytes_s, self.config.longest_toss_s, self.config.reserve_gb)
             plan = self.thrower.prepare(toss, attempt, self.progress)
@@ -113,15 +112,15 @@ class SessionRun:
             take = self._take(toss, plan, options.fixed_s)
             report.takes.append(take)
             self.operator.say(f"{toss_name(toss)}: {take.decision} ({take.verdict.text()})")
-            stop = next((t for t in take.verdict.reasons if "emergency stop" in t), "")
             if take.decision == "accept":
-                toss, attempt = toss + 1, 0
-            elif take.decision == "redo" and attempt < self.config.redo_at_most and not stop:
-                attempt += 1
-            elif take.decision == "reject" and not stop and not self.operator.headless:
-                toss, attempt = toss + 1, 0
-            else:
-                report.stopped = stop or f"{toss_name(toss)} was rejected {attempt + 1} times"
+                toss, attempt, rejected = toss + 1, 0, 0
+                continue
+            rejected += 1
+            if take.decision == "reject" or self.operator.headless:
+                attempt += 1  # another toss under the same number; `redo` asks for the same one again
+            report.stopped = next((r for r in take.verdict.reasons if "emergency stop" in r), "")
+            if not report.stopped and self.operator.headless and rejected > self.config.redo_at_most:
+                report.stopped = f"{toss_name(toss)} was rejected {rejected} times"
         return report
 
     def _take(self, toss: int, plan: TossPlan | None, fixed_s: float | None) -> TossReport:

@@ -72,7 +72,8 @@ def small_rig(**recording: Any) -> Rig:
         DeviceEntry("gripper", "gripper", "synthetic", rate_hz=50.0),
     )
     config = replace(
-        RecordingConfig(countdown_s=0.0, pre_trigger_s=0.3, queue_s=4.0, longest_gap_s=PATIENT_S), **recording
+        RecordingConfig(countdown_s=0.0, pre_trigger_s=0.3, queue_s=4.0, longest_gap_s=PATIENT_S, redo_at_most=0),
+        **recording,
     )
     return Rig("small", devices, Path("small.toml"), "panda", recording=config)
 

@@ -66,9 +66,9 @@ def test_a_full_queue_refuses_at_once_and_a_mark_always_finds_room() -> None:
     queue: BoundedQueue[int] = BoundedQueue(2)
     assert [queue.offer(k) for k in range(4)] == [True, True, False, False]
     mark = queue.mark()
-    assert [queue.take(0), queue.take(0)] == [0, 1]
-    assert queue.take(0) is mark
-    assert queue.take(0) is None
+    assert [queue.take(0.0), queue.take(0.0)] == [0, 1]
+    assert queue.take(0.0) is mark
+    assert queue.take(0.0) is None
     queue.close()
     assert not queue.offer(5)
     assert queue.closed
@@ -101,7 +101,7 @@ class Sheet:
 
 def test_a_take_holds_the_ring_before_it_and_nothing_after_its_end() -> None:
     sheet = Sheet()
-    lane = Lane("/x", 100, 5.0, 0.5, sheet.write)
+    lane = Lane("/x", 100.0, 5.0, 0.5, sheet.write)
     lane.start()
     now = time.monotonic_ns()
     for k in range(10):
@@ -115,7 +115,7 @@ def test_a_take_holds_the_ring_before_it_and_nothing_after_its_end() -> None:
     assert lane.mark().wait(2)
     lane.offer(Item(11, now + 20_000_000))  # belongs to the take, but comes too late for it
     lane.offer(Item(12, now + 100_000_000))
-    assert lane.stop(2)
+    assert lane.stop(2.0)
     assert sheet.written[-1] == 10
     assert set(sheet.written) <= set(range(5, 11))
     tally = lane.counter.tally()
@@ -124,14 +124,14 @@ def test_a_take_holds_the_ring_before_it_and_nothing_after_its_end() -> None:
 
 
 def test_a_slow_writer_never_makes_the_driver_wait() -> None:
-    lane = Lane("/x", 100, 0.1, 0.5, Sheet(slow_s=0.05).write)
+    lane = Lane("/x", 100.0, 0.1, 0.5, Sheet(slow_s=0.05).write)
     lane.start()
     lane.take = Take(None, 0)  # type: ignore[arg-type]
     began = time.monotonic()
     for k in range(1000):
         lane.offer(Item(k, time.monotonic_ns()))
     assert time.monotonic() - began < 0.5
-    lane.stop(5)
+    lane.stop(5.0)
     tally = lane.counter.tally()
     assert tally.dropped["queue full"] > 900
     assert tally.received == tally.written + tally.dropped_total + tally.idle
@@ -139,7 +139,7 @@ def test_a_slow_writer_never_makes_the_driver_wait() -> None:
 
 GOOD = {"/d455/color": Tally(received=100, written=100)}
 STOPPED = Trouble(0, "arm", "user_stopped", "pressed", "error")
-SEEN = TossEvents(Moment(1, 0.01, "x"), Moment(1.3, 0.01, "x"), Moment(2, 0.1, "x"))
+SEEN = TossEvents(Moment(1.0, 0.01, "x"), Moment(1.3, 0.01, "x"), Moment(2.0, 0.1, "x"))
 
 
 @pytest.mark.parametrize(
@@ -147,7 +147,7 @@ SEEN = TossEvents(Moment(1, 0.01, "x"), Moment(1.3, 0.01, "x"), Moment(2, 0.1, "
     [
         (GOOD, (), SEEN, "accept", "accept"),
         (GOOD, (), TossEvents(), "reject", "no release was seen"),
-        (GOOD, (), TossEvents(Moment(1, 0.01, "x")), "accept", "not seen: first impact, rest"),
+        (GOOD, (), TossEvents(Moment(1.0, 0.01, "x")), "accept", "not seen: first impact, rest"),
         ({"/a": Tally(received=100, written=97, dropped={"queue full": 3})}, (), SEEN, "accept", "3 of 100 lost"),
         ({"/a": Tally(received=80, written=80, missed=20)}, (), SEEN, "reject", "20 of 100 lost (20 missing"),
         ({"/a": Tally()}, (), SEEN, "reject", "/a: nothing was written"),
