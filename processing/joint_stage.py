@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
 MARGIN_PX = 6
 BORDER_PX = 2
+FEWEST_PX = 100
 
 
 def joint_stage(run: Run, tracks: Mapping[int, Done], shape: Done, masks: Mapping[int, Done]) -> Done:
@@ -42,6 +43,11 @@ def joint_stage(run: Run, tracks: Mapping[int, Done], shape: Done, masks: Mappin
         for done, (toss, track) in enumerate(before.items()):
             progress.step(done, len(before) + 1, f"toss {toss}")
             frames += frames_of(run, track, masks[toss], run.config.joint)
+        if not frames:
+            write_shape(folder, body)
+            for track in before.values():
+                write_track(folder, track)
+            return {"frames": 0, "kept_out": f"no tracked frame shows {FEWEST_PX} pixels: nothing to solve jointly"}
         poses = np.stack([before[f.toss].camera_from_object[f.position] for f in frames])
         world = outside(run, before, frames, body)
         found = solve_jointly(frames, poses, body, run.camera, world, run.config.joint)
@@ -61,7 +67,7 @@ def frames_of(run: Run, track: ObjectTrack, masks: Done, config: JointConfig) ->
     out = []
     for i, status in enumerate(track.status):
         mask = np.asarray(seen[i], dtype=bool)
-        if status != "tracked" or mask.sum() < 100:
+        if status != "tracked" or mask.sum() < FEWEST_PX:
             continue
         pose = track.camera_from_object[i]
         at_depth = np.linalg.inv(pose) @ pose_at(track, i, int(streams.depth_times_ns[i]))

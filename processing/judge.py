@@ -12,6 +12,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from numpy import ndarray as Array
+from scipy.stats import t as student
 
 from processing.reproject import RaycastRenderer
 from recordings.geometry import CameraModel
@@ -20,6 +21,11 @@ from recordings.tracks import ObjectShape, ObjectTrack
 
 FAR_M = 0.02
 """Residuals beyond this are one and the same: not explained."""
+SLACK_M = 5e-5
+"""A mean depth residual larger by less than this is not called worse: depth cameras err by twenty times as much, and
+the poses were fitted to one of the two shapes."""
+CHANCE = 0.05
+"""Nor is one that chance alone makes this often."""
 
 
 @dataclass(frozen=True)
@@ -61,6 +67,48 @@ class Explained:
         return Evidence(
             float(depth_m), float(mask), float(color.mean()) if len(color) else float("nan"), len(self.rows), self.lost
         )
+
+
+@dataclass(frozen=True)
+class Difference:
+    """Mean of the differences of depth residuals in the same frames (m; positive: the second is worse), its standard
+    error, the frames, and how many independent ones they are worth."""
+
+    mean_m: float
+    error_m: float
+    frames: int
+    independent: float
+
+    @property
+    def worse(self) -> bool:
+        """Whether the second explains raw depth worse: by more than SLACK_M, and by more than chance makes it."""
+        if self.frames < 2:
+            return self.mean_m > SLACK_M
+        beyond = float(student.ppf(1 - CHANCE, max(self.independent - 1, 1.0))) * self.error_m
+        return self.mean_m > max(SLACK_M, beyond)
+
+    def __str__(self) -> str:
+        return f"{1e3 * self.mean_m:+.3f} mm, standard error {1e3 * self.error_m:.3f} mm, {self.frames} frames"
+
+
+def difference(first: Explained, second: Explained) -> Difference:
+    """Depth residuals of two shapes (or poses) compared frame by frame: what is hard to see in a frame (its noise, its
+    outline) is in both, and cancels.
+
+    Neighbouring frames see the same faces: with r their correlation, n of them are worth n (1 - r) / (1 + r).
+    """
+    a, b = ({(int(r[0]), int(r[1])): float(r[2]) for r in rows} for rows in (first.rows, second.rows))
+    both = [place for place in a if place in b]
+    if not both:
+        return Difference(float("nan"), float("nan"), 0, 0.0)
+    gaps, toss = np.array([b[p] - a[p] for p in both]), np.array([p[0] for p in both])
+    n, off = len(gaps), gaps - gaps.mean()
+    if n < 2 or not off.any():
+        return Difference(float(gaps.mean()), 0.0, n, float(n))
+    alike = float((off[:-1] * off[1:])[toss[:-1] == toss[1:]].sum() / (off**2).sum())
+    r = min(max(alike, 0.0), 0.95)
+    worth = n * (1 - r) / (1 + r)
+    return Difference(float(gaps.mean()), float(gaps.std(ddof=1) / np.sqrt(worth)), n, worth)
 
 
 def explain(

@@ -17,6 +17,7 @@ from recordings.tracks import RigCalibration
 
 WIDTH, HEIGHT, FOCAL = 160, 120, 150.0
 BOX_M = np.array([0.10, 0.08, 0.06])
+OTHER_M = np.array([0.05, 0.05, 0.14])
 FRAME_NS = 33_333_333
 CAMERA_HEIGHT_M = 0.6
 FACES_RGB = np.array([[200, 40, 40], [40, 200, 40], [40, 40, 200], [200, 200, 40], [200, 40, 200], [40, 200, 200]])
@@ -41,7 +42,12 @@ class TinyWorld:
         return out
 
     def see(
-        self, world_from_object: Transform | None, index: int = 0, hand: bool = False
+        self,
+        world_from_object: Transform | None,
+        index: int = 0,
+        hand: bool = False,
+        box_m: np.ndarray = BOX_M,
+        faces_rgb: np.ndarray = FACES_RGB,
     ) -> tuple[RgbdFrame, np.ndarray]:
         """The frame and the box's true mask; `hand` puts a brown bar in front of a part of it."""
         import open3d
@@ -50,7 +56,7 @@ class TinyWorld:
         table = open3d.t.geometry.TriangleMesh.create_box(4, 4, 0.1).translate([-2, -2, -0.1])
         scene.add_triangles(table)
         if world_from_object is not None:
-            box = open3d.t.geometry.TriangleMesh.create_box(*BOX_M).translate(-BOX_M / 2)
+            box = open3d.t.geometry.TriangleMesh.create_box(*box_m).translate(-box_m / 2)
             scene.add_triangles(box.transform(world_from_object.matrix))
         if hand and world_from_object is not None:
             bar = open3d.t.geometry.TriangleMesh.create_box(0.5, 0.02, 0.02)
@@ -65,19 +71,28 @@ class TinyWorld:
         u, v = np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))
         color += (8 * np.sin(u / 5) * np.cos(v / 7)).astype(np.int64)[..., None]
         face = hit["primitive_ids"].numpy().astype(np.int64) // 2 % 6
-        color[what == 1] = FACES_RGB[face[what == 1]]
+        color[what == 1] = faces_rgb[face[what == 1]]
         color[what == 2] = (90, 60, 30)
         depth = np.where(np.isfinite(depth), np.round(depth, 3), 0).astype(np.float32)
         frame = RgbdFrame("d455", index, index * FRAME_NS, index * FRAME_NS, color.astype(np.uint8), depth)
         return frame, what == 1
 
-    def record(self, folder: Path, tosses: Sequence[int] = (0, 1), frames: int = 8, first_mask: bool = True) -> Path:
-        """A session of these tosses on disk."""
+    def record(
+        self,
+        folder: Path,
+        tosses: Sequence[int] = (0, 1),
+        frames: int = 8,
+        first_mask: bool = True,
+        others: Sequence[int] = (),
+        gone: Callable[[int, int], bool] = lambda toss, frame: False,
+    ) -> Path:
+        """A session of these tosses on disk. In `others` another object is thrown; `gone(toss, frame)`: unseen."""
         with SessionWriter(folder, {"name": folder.name, "object": {"name": "box"}}, self.calibration) as session:
             for toss in tosses:
                 with session.toss(toss) as writer:
                     for i, pose in enumerate(self.poses(frames, toss)):
-                        frame, mask = self.see(pose, i)
+                        look = {"box_m": OTHER_M, "faces_rgb": 255 - FACES_RGB[::-1]} if toss in others else {}
+                        frame, mask = self.see(None if gone(toss, i) else pose, i, **look)
                         writer.color(self._encoded(frame))
                         raw = np.round(frame.depth_m * 1000).astype(np.uint16)
                         writer.depth(DepthImage("d455", i, frame.time_ns, frame.time_ns, 0.001, raw))
