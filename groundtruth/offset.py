@@ -63,7 +63,12 @@ def object_from_tagged_by_mesh(
     outward = np.repeat(np.array([-T[:3, 2] for T in layout.values()]), len(CORNERS_PUPIL), axis=0)
     surface = _Surface(vertices_m, faces)
     middle = 0.5 * (vertices_m.min(axis=0) + vertices_m.max(axis=0))
-    fits = [_fitted(surface, corners, outward, start, middle) for start in _starts()]
+    random = list(Rotation.random(120, random_state=np.random.default_rng(0)).as_matrix())
+    rough = [_fitted(surface, corners, outward, start, middle, 8) for start in cube_turns() + random]
+    few = sorted(rough, key=lambda f: f[1])[:12]
+    fits = [_fitted(surface, corners, outward, pose[:3, :3], middle, 25) for pose, _ in few]
+    first = min(fits, key=lambda f: f[1])[0]
+    fits += [_fitted(surface, corners, outward, S @ first[:3, :3], middle, 8) for S in cube_turns()]
     best = min(rms for _, rms in fits)
     alike: list[Array] = []
     for pose, rms in sorted(fits, key=lambda f: f[1]):
@@ -76,17 +81,16 @@ def _apart(a: Array, b: Array) -> float:
     return float(Rotation.from_matrix(a[:3, :3].T @ b[:3, :3]).magnitude())
 
 
-def _starts() -> list[Float[Array, "3 3"]]:
-    """The 24 turns of a cube, each also turned by 45 degrees about two axes."""
-    cube = []
+def cube_turns() -> list[Float[Array, "3 3"]]:
+    """The 24 turns that leave a cube as it is."""
+    turns = []
     for order in itertools.permutations(range(3)):
         for signs in itertools.product((1.0, -1.0), repeat=3):
             R = np.zeros((3, 3))
             R[range(3), order] = signs
             if np.linalg.det(R) > 0:
-                cube.append(R)
-    between = [np.eye(3), *(Rotation.from_euler(a, 45, degrees=True).as_matrix() for a in ("x", "z"))]
-    return [R @ B for B in between for R in cube]
+                turns.append(R)
+    return turns
 
 
 class _Surface:
@@ -103,6 +107,11 @@ class _Surface:
         found = self._scene.compute_closest_points(self._tensor(points_m.astype(np.float32)))
         return found["points"].numpy().astype(np.float64), found["primitive_normals"].numpy().astype(np.float64)
 
+    def outside(self, points_m: Float[Array, "n 3"], directions: Float[Array, "n 3"]) -> bool:
+        """Whether rays from all these points meet the surface an even number of times: any winding of faces will do."""
+        rays = self._tensor(np.concatenate([points_m, directions], axis=1).astype(np.float32))
+        return not bool((self._scene.count_intersections(rays).numpy() % 2).any())
+
 
 def _fitted(
     surface: _Surface,
@@ -110,15 +119,17 @@ def _fitted(
     outward: Float[Array, "n 3"],
     start: Float[Array, "3 3"],
     middle: Float[Array, "3"],
+    turns: int,
 ) -> tuple[Float[Array, "4 4"], float]:
     pose = np.eye(4)
     pose[:3, :3] = start
     pose[:3, 3] = middle - start @ corners.mean(axis=0)
     rms = np.inf
-    for turning in [False] * 6 + [True] * 25:  # first into place: the tags' middle need not be the object's
+    for turning in [False] * 6 + [True] * turns:  # first into place: the tags' middle need not be the object's
         moved = corners @ pose[:3, :3].T + pose[:3, 3]
         points, normals = surface.nearest(moved)
         turned = outward @ pose[:3, :3].T
+        normals = normals * np.where((normals * turned).sum(axis=1) < 0, -1.0, 1.0)[:, None]
         off = ((moved - points) * normals).sum(axis=1)
         tilt = np.cross(turned, normals) * 0.03  # a print askew by a radian counts as 3 cm
         rms = float(np.sqrt((np.linalg.norm(moved - points, axis=1) ** 2).mean() + (tilt**2).sum(axis=1).mean()))
@@ -134,11 +145,10 @@ def _fitted(
         pose[:3, :3] = R @ pose[:3, :3]
         if turning and np.linalg.norm(step) < 1e-7:
             break
-    if (
-        np.einsum("ij,ij->i", outward @ pose[:3, :3].T, surface.nearest(corners @ pose[:3, :3].T + pose[:3, 3])[1]) < 0
-    ).any():
-        rms = 1.0  # inside out
-    return pose, rms
+    turned = outward @ pose[:3, :3].T
+    middles = slice(len(CORNERS_PUPIL) - 1, None, len(CORNERS_PUPIL))
+    above = (corners @ pose[:3, :3].T + pose[:3, 3] + (2 * rms + 0.001) * turned)[middles]
+    return pose, rms if surface.outside(above, turned[middles] + 1e-4) else 1.0
 
 
 def _lean(normals: Float[Array, "n 3"]) -> Float[Array, "m 3"]:

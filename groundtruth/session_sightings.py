@@ -9,9 +9,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Int64, UInt8
+from jaxtyping import Float, UInt8
 from numpy import ndarray as Array
 
+from calibration.tag_faults import explain_absence
 from calibration.tags import TagDetection, detect_tags
 from recordings.codec import decode_image
 from recordings.errors import BadInput
@@ -20,7 +21,6 @@ from recordings.session import Session, Toss
 from recordings.tracks import RigCalibration
 
 CACHE = ".cache/tags"
-FAMILIES = ("tag36h11", "tag25h9", "tag16h5", "tagStandard41h12", "tagStandard52h13")
 STILL_PX = 1.5
 """A tag whose centre stays within this over a toss does not move."""
 MOVES_PX = 25.0
@@ -45,7 +45,7 @@ class Sightings:
     one image, and in how many. `lost_images`: on which the detector died."""
 
     seen: tuple[TagSeen, ...]
-    frames: Mapping[int, Mapping[str, Int64[Array, " n"]]]
+    frames: Mapping[int, Mapping[str, Array]]
     twice: Mapping[int, int]
     lost_images: int
 
@@ -62,8 +62,11 @@ def find_tags(
     offset_ns: int,
     progress: Progress,
 ) -> Sightings:
-    """Detect tags in all mono images, cached beside the session. `offset_ns` is added to their stamps. Raises BadInput where there is no image or no tag."""
-    frames: dict[int, dict[str, Int64[Array, " n"]]] = {}
+    """Detect tags in all mono images, cached beside the session. `offset_ns` is added to their stamps.
+
+    Raises BadInput where there is no image or no tag.
+    """
+    frames: dict[int, dict[str, Array]] = {}
     for number in tosses:
         toss = session.toss(number)
         frames[number] = {name: toss.mono(name).times_ns + offset_ns for name in mono_cameras(toss)}
@@ -124,15 +127,11 @@ def _single(seen: Sequence[TagSeen]) -> tuple[list[TagSeen], dict[int, int]]:
 def _no_tags(session: Session, counts: Sequence[tuple[int, str, int]], family: str, total: int) -> str:
     """Why there may be none: another family, or mirrored images, are looked for in a few of them."""
     cameras = ", ".join(sorted({camera for _, camera, _ in counts}))
-    text = f"no tag of {family} in {total} images of {cameras}"
-    few = [image for k, image in enumerate(_images(session, counts)) if k % max(1, total // 6) == 0][:8]
-    for other in (f for f in FAMILIES if f != family):
-        if sum(map(len, detect_tags(few, other))) > 1:
-            return f"{text}, but tags of {other}; type `--family {other}`"
-    if sum(map(len, detect_tags([np.ascontiguousarray(i[:, ::-1]) for i in few], family))):
-        return f"{text}, but there are in the mirrored images: print the tags, or set up the cameras, unmirrored"
-    dark = float(np.mean([i.mean() for i in few]))
-    return f"{text}; their mean grey is {dark:.0f} of 255: check light, exposure and focus (`toss-view {session.path}`)"
+    few = [image for k, image in enumerate(_images(session, counts)) if k % max(1, total // 6) == 0]
+    return (
+        f"no tag of {family} in {total} images of {cameras}: {explain_absence(few, family)}. Look at them with "
+        f"`toss-view {session.path}`; another family is given by `--family`"
+    )
 
 
 @dataclass(frozen=True, eq=False)

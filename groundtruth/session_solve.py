@@ -219,7 +219,7 @@ def _observations(sightings: Sightings, config: TagSlamConfig, settings: SolveCo
     return tuple(out)
 
 
-Order = Mapping[int, tuple[Int64[Array, " n"], Int64[Array, " n"]]]
+Order = Mapping[int, tuple[Array, Array]]
 """Per toss: times (ns) and the numbers of the body's poses at them."""
 
 
@@ -355,13 +355,23 @@ def _solved(
         sizes_m={i: tag.size_m for i, tag in problem.tags.items()},
         cameras={name: poses[number] for name, number in names.items()},
         camera_covariance={name: spread[number] for name, number in names.items()},
-        moved={key: _apart(poses[names[key[0]]], poses[number]) for key, number in drifting.items()},
+        moved=_moved({key: poses[number] for key, number in drifting.items()}),
         center_m=center,
         corners=corners,
         unplaced=tuple(" ".join(k[:2]) for k in growth.missing()),
         arcs=len(in_flight),
         noise_factor=factor,
     )
+
+
+def _moved(places: Mapping[tuple[str, int], Float[Array, "4 4"]]) -> dict[tuple[str, int], tuple[float, float]]:
+    """How far each camera stood, in each toss, from where it stood in most (the place nearest to all its others)."""
+    found: dict[tuple[str, int], tuple[float, float]] = {}
+    for camera in sorted({name for name, _ in places}):
+        mine = {toss: pose for (name, toss), pose in places.items() if name == camera}
+        usual = min(mine.values(), key=lambda p: sum(_apart(p, q)[1] + 0.5 * _apart(p, q)[0] for q in mine.values()))
+        found |= {(camera, toss): _apart(usual, pose) for toss, pose in mine.items()}
+    return found
 
 
 def _apart(a: Float[Array, "4 4"], b: Float[Array, "4 4"]) -> tuple[float, float]:

@@ -19,7 +19,7 @@ from recordings.view_layers import Clock, image_entity
 from recordings.view_scene import Scene
 
 SEEN_COLOR, LEFT_COLOR, SIGMA_COLOR = (70, 230, 120), (255, 70, 70), (255, 160, 40)
-LEFT_GAIN = 50.0
+LEFT_GAIN = 200.0
 """Arrows of what is left are drawn this many times longer."""
 SIGMAS = 30.0
 """Ellipsoids are drawn at this many standard deviations: three would not be seen."""
@@ -27,7 +27,7 @@ TAGS, CAMERAS, PATH = "truth_tags", "world/path/truth_cameras", "world/path/trut
 
 
 def log_truth(clock: Clock, scene: Scene) -> None:
-    """Nothing where the session's truth was not made by toss-truth. Raises DamagedFile for files that cannot be read."""
+    """Nothing where the session's truth was not made by toss-truth. Raises DamagedFile for unreadable files."""
     folder = scene.session.truth_folder if scene.session is not None else None
     file = None if folder is None else folder / "tags" / f"toss_{clock.toss:02d}.npz"
     if folder is None or file is None or not file.exists() or scene.root != "world":
@@ -44,7 +44,7 @@ def log_truth(clock: Clock, scene: Scene) -> None:
 
 
 def log_tags(clock: Clock, scene: Scene, data: dict[str, Array], names: list[str]) -> None:
-    """Every tag's outline as seen, and from its corners arrows to where the solution has them, LEFT_GAIN times longer."""
+    """Every tag's outline as seen, and arrows from its corners to where they should be, LEFT_GAIN times as long."""
     for number, name in enumerate(names):
         entity = f"{image_entity(scene, name)}/{TAGS}"
         for time_ns in np.unique(data["time_ns"][data["camera"] == number]).tolist():
