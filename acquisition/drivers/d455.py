@@ -35,6 +35,7 @@ from recordings.importers.realsense import camera_model, color_from_depth
 
 COLOR_FRAME, DEPTH_FRAME = "d455", "d455_depth"
 QUEUE = 32
+LAST_FRAMES_MS = 300
 
 
 class D455Camera:
@@ -112,9 +113,10 @@ class D455Camera:
             fast = self._file is not None and self._playback == "fast"
             self._queue = None if fast else self._rs.frame_queue(QUEUE, True)
             config = self._config(str(self._about["serial"]))
+            if self._file is not None:  # before it starts, or the first frames go their own pace
+                resolved = config.resolve(self._rs.pipeline_wrapper(self._pipeline))
+                resolved.get_device().as_playback().set_real_time(not fast)
             self._profile = self._start(config) if fast else self._start(config, self._queue)
-            if self._file is not None:
-                self._profile.get_device().as_playback().set_real_time(not fast)
             self._align = self._rs.align(self._rs.stream.color) if self._settings.align else None
             self._running = True
 
@@ -283,10 +285,11 @@ class D455Camera:
         end = time.monotonic() + timeout_s
         while True:
             left_s = max(0.0, end - time.monotonic())
-            came, frame = wait(max(1, round(1000 * min(left_s, 0.1))))
+            ended = self._has_ended()  # asked first: what was played until then is still on its way
+            came, frame = wait(LAST_FRAMES_MS if ended else max(1, round(1000 * min(left_s, 0.1))))
             if came:
                 return frame.as_frameset()
-            if self._has_ended():
+            if ended:
                 self._lost = f"{self.name}: the recording {self._file} has ended"
             if self._lost is not None:
                 raise DeviceLost(self._lost)

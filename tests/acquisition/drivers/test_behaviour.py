@@ -26,8 +26,8 @@ class Backend:
     make: Callable[..., Any]
     """Keyword `serial` reaches the driver."""
     protocol: Any
-    lossy: Callable[[], Any]
-    """A driver (not opened) whose device loses something while it streams."""
+    lossy: Callable[[], tuple[Any, Callable[[], None]]]
+    """A driver (not opened), and what makes its device lose something once it streams."""
     unplug: Callable[[], None]
     """Takes the device away, for the rest of the test."""
     items: int = 8
@@ -42,7 +42,7 @@ def d455(ask: Callable[[str], Any]) -> Iterator[Backend]:
     yield Backend(
         make=lambda **given: D455Camera(file=whole, **given),
         protocol=RgbdCamera,
-        lossy=lambda: D455Camera(file=gap),
+        lossy=lambda: (D455Camera(file=gap), lambda: None),
         unplug=lambda: None,  # the recording ends by itself
     )
 
@@ -61,7 +61,7 @@ def genicam(ask: Callable[[str], Any]) -> Iterator[Backend]:
         yield Backend(
             make=lambda serial="GV01": GenicamCamera(serial=serial, settings=settings),
             protocol=MonoCamera,
-            lossy=lambda: GenicamCamera(serial="GV02", settings=settings),
+            lossy=lambda: (GenicamCamera(serial="GV02", settings=settings), lambda: None),
             unplug=whole.close,
         )
 
@@ -72,9 +72,8 @@ def franka(ask: Callable[[str], Any]) -> Iterator[Backend]:
 
     address, simulator = ask("fci")
 
-    def lossy() -> FrankaArm:
-        simulator.inject("lost_packets", share=0.1)
-        return FrankaArm(host=address)
+    def lossy() -> tuple[FrankaArm, Callable[[], None]]:
+        return FrankaArm(host=address), lambda: simulator.inject("lost_packets", share=0.1)
 
     yield Backend(lambda **given: FrankaArm(host=address, **given), Arm, lossy, lambda: simulator.inject("unplug"))
     simulator.clear("unplug")
@@ -87,9 +86,8 @@ def franka_hand(ask: Callable[[str], Any]) -> Iterator[Backend]:
 
     address, simulator = ask("fci")
 
-    def lossy() -> FrankaHand:
-        simulator.inject("gripper_freeze", at_s=1.0, for_s=0.4)
-        return FrankaHand(host=address)
+    def lossy() -> tuple[FrankaHand, Callable[[], None]]:
+        return FrankaHand(host=address), lambda: simulator.inject("gripper_freeze", at_s=0.2, for_s=0.4)
 
     yield Backend(
         lambda **given: FrankaHand(host=address, **given), Gripper, lossy, lambda: simulator.inject("gripper_unplug")
@@ -103,9 +101,8 @@ def ur(ask: Callable[[str], Any]) -> Iterator[Backend]:
 
     address, simulator = ask("rtde")
 
-    def lossy() -> UrArm:
-        simulator.inject("freeze", at_s=1.6, for_s=0.2)
-        return UrArm(host=address)
+    def lossy() -> tuple[UrArm, Callable[[], None]]:
+        return UrArm(host=address), lambda: simulator.inject("freeze", at_s=0.1, for_s=0.2)
 
     yield Backend(lambda **given: UrArm(host=address, **given), Arm, lossy, lambda: simulator.inject("unplug"))
     simulator.clear("unplug")
@@ -125,11 +122,11 @@ def synthetic(name: str, kind: str, protocol: Any, rate_hz: float = 30.0) -> Ite
             pytest.skip("a simulated device is what the rig calls it: it takes no serial")
         return lab.device(name, kind, rate_hz)
 
-    def lossy() -> Any:
+    def lossy() -> tuple[Any, Callable[[], None]]:
         if kind == "gripper":
             pytest.skip("the simulated fingers lose no state")
-        lab.faults(name).inject("silence" if kind == "arm" else "gap", at_s=0.2, for_s=0.2)
-        return make()
+        fault = "silence" if kind == "arm" else "gap"
+        return make(), lambda: lab.faults(name).inject(fault, at_s=0.2, for_s=0.2)
 
     yield Backend(make, protocol, lossy, lambda: lab.faults(name).inject("unplug"))
 
@@ -281,8 +278,11 @@ def gaps(found: list[tuple[str, int, int, int]]) -> int:
 
 def test_what_is_lost_is_counted_or_shows_in_the_numbers(backend: Backend) -> None:
     found: list[tuple[str, int, int, int]] = []
-    with backend.lossy() as device:
+    lossy, trouble = backend.lossy()
+    with lossy as device:
         device.start()
+        found += [mark for item in gather(device, 2) for mark in marks(item)]
+        trouble()
         end = time.monotonic() + PATIENCE_S
         while not sum(device.health().dropped.values()) and not gaps(found) and time.monotonic() < end:
             try:
