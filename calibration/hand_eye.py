@@ -86,7 +86,7 @@ def calibrate_hand_eye(
     start = best_start(camera_from_board, moved)
     looks = _Looks(model, [views[k] for k in used], moved, mounting)
     solved = _refine(looks, start, arm)
-    hold_out = _hold_out(looks, start, arm)
+    hold_out = _hold_out(looks, (solved.camera_from_mount, solved.held_from_board), arm)
     findings = [Finding("refused", text) for text in missing] + _judge(solved, hold_out, len(used))
     mm, deg = _spread(solved.covariance)
     report = Report(
@@ -318,7 +318,7 @@ def _gauss_newton(residuals: Callable[[Array], Array], numbers: Array, owner: Ar
         if cost < best:
             gain, best, numbers, damping = best - cost, cost, trial, max(damping / 10, 1e-9)
             left = weight * plain
-            if gain < 1e-7 * cost:
+            if gain < 1e-5 * cost:
                 break
             J = weight[:, None] * _jacobian(residuals, numbers, plain, owner)
         else:

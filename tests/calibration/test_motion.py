@@ -38,7 +38,7 @@ def off(found, true):
 
 
 def arm_case(geometry, seed, mounting, turn_deg=45.0, axes=(1, 1, 1), noise=1.0):
-    """Twenty robot poses with a board 0.5 mm and 0.1 deg off, and an arm 0.05 deg and 0.2 mm off."""
+    """Fifteen robot poses with a board 0.5 mm and 0.1 deg off, and an arm 0.05 deg and 0.2 mm off."""
     rng = np.random.default_rng(seed)
     model = geometry.camera("d455", 430.0, (848, 480))
     mount = geometry.pose(
@@ -46,7 +46,7 @@ def arm_case(geometry, seed, mounting, turn_deg=45.0, axes=(1, 1, 1), noise=1.0)
     )
     held = geometry.pose(0.5 * rng.normal(size=3), [0.05, 0.02, 0.1])
     robot, views = [], []
-    for _ in range(20):
+    for _ in range(15):
         turn = rng.normal(size=3) * axes
         turn *= np.radians(turn_deg) * rng.uniform(0.5, 1) / np.linalg.norm(turn)
         facing = Rotation.from_rotvec(turn) * Rotation.from_euler("x", np.pi)
