@@ -81,7 +81,7 @@ def _second_difference(time_s: Float[Array, " n"]) -> sparse.csr_array:
     return sparse.csr_array(sparse.diags_array(bands, offsets=[0, 1, 2], shape=(n - 2, n)))
 
 
-def _factor(information: sparse.csr_array, width: int) -> Float[Array, "b n"]:
+def _factor(information: sparse.sparray, width: int) -> Float[Array, "b n"]:
     """The Cholesky factor of a matrix with `width` diagonals on either side, in LAPACK's lower banded form.
 
     Dense algebra on matrices of this size lets BLAS start threads that cost more CPU than they save.
