@@ -101,8 +101,7 @@ def second_pass(run: Run, refined: Pass, masks: Mapping[int, Done], name: str, i
     drawn = align_stage(run, name, refined.tracks, shape, masks, icp)
     tracks = second_tracks(run, name, drawn, shape, masks)
     field_of = second_field(run, name, tracks, drawn, shape, masks)
-    return replace(refined, tracks=tracks, shapes=dict.fromkeys(tracks, field_of),
-                   masks=dict.fromkeys(tracks, drawn))  # fmt: skip
+    return replace(refined, tracks=tracks, shapes=dict.fromkeys(tracks, field_of))
 
 
 def _until_converged(run: Run, start: Pass, name: str) -> Pass:
