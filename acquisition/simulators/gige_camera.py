@@ -5,7 +5,7 @@
         camera.inject("lost_trigger", for_s=1.0)
 
 GVCP (control, port 3956) and GVSP (images) over UDP. Its clock starts at `clock_ns` and counts nanoseconds. Chunk
-timestamps mark the exposure's start; the leader's is when the image began to leave, as on many cameras.
+timestamps mark the exposure's start; the leader's is `readout_s` after its end, as on cameras that stamp the transfer.
 """
 
 from __future__ import annotations
@@ -41,16 +41,16 @@ CONTROL_PRIVILEGE, HEARTBEAT_MS = 0x0A00, 0x0938
 LEADER, TRAILER, PAYLOAD = 1, 2, 3
 IMAGE, IMAGE_WITH_CHUNKS = 0x0001, 0x4001
 OVERHEAD = 36
-READOUT_NS = 5_000_000
 
 
 class GigeCamera:
     """One camera at a loopback address, until closed. Made inside the network that it is to be found in."""
 
-    def __init__(self, address: str, serial: str, clock_ns: int = 0) -> None:
+    def __init__(self, address: str, serial: str, clock_ns: int = 0, readout_s: float = 0.005) -> None:
         self._address, self._faults, self._random = loopback(address), Faults(FAULTS), random.Random(serial)
         self._memory = bytearray(registers.XML_ADDRESS) + bytearray(registers.description())
         self._clock_ns = clock_ns - time.monotonic_ns()
+        self._readout_ns = round(readout_s * 1e9)
         self._counts = {"triggers": 0, "images": 0, "sent": 0}
         self._number = 0
         self._closed = threading.Event()
@@ -228,7 +228,7 @@ class GigeCamera:
         with_chunks = self._get(registers.CHUNK_MODE) == 1
         data = pixels.tobytes() + (self._chunks(at_ns, pixels.size) if with_chunks else b"")
         height, width = pixels.shape
-        sent_ns = at_ns + round(self._get_float(registers.EXPOSURE_US) * 1e3) + READOUT_NS
+        sent_ns = at_ns + round(self._get_float(registers.EXPOSURE_US) * 1e3) + self._readout_ns
         kind = IMAGE_WITH_CHUNKS if with_chunks else IMAGE
         leader = struct.pack(">HHQ5IHH", 0, kind, sent_ns, registers.MONO8, width, height, 0, 0, 0, 0)
         block = (self._get(STREAM_PACKET) & 0xFFFF) - OVERHEAD
