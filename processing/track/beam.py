@@ -338,8 +338,9 @@ def _standing(scene: Scene, h: Hypothesis, i: int, config: BeamConfig) -> Candid
 def merged(candidates: list[Candidate], config: BeamConfig) -> list[Candidate]:
     """Sorted by cost, without those that say the same as a better one."""
     kept: list[Candidate] = []
+    near = 1 + 2 * np.cos(np.radians(config.apart_deg))  # the trace of a turn by that angle
     for c in sorted(candidates, key=lambda c: c.cost):
-        if all(np.degrees(np.linalg.norm(turn_between(c.pose, o.pose))) > config.apart_deg for o in kept):
+        if all(np.vdot(c.pose[:3, :3], o.pose[:3, :3]) < near for o in kept):
             kept.append(c)
     return kept
 

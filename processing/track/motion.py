@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,7 +31,13 @@ class MotionConfig:
 
 def turn_between(after: Float[Array, "4 4"], before: Float[Array, "4 4"]) -> Float[Array, "3"]:
     """Rotation vector (camera frame) from one pose to a later one."""
-    return rotation_log(after[:3, :3] @ before[:3, :3].T)
+    turn = after[:3, :3] @ before[:3, :3].T
+    cosine = 0.5 * (turn[0, 0] + turn[1, 1] + turn[2, 2] - 1.0)
+    if cosine < -0.9:  # near half a turn the axis is not in the antisymmetric part
+        return rotation_log(turn)
+    axis = 0.5 * np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
+    sine = math.sqrt(float(axis @ axis))
+    return axis * (math.atan2(sine, cosine) / sine) if sine > 1e-9 else axis
 
 
 def steady_spin(

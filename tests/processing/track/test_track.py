@@ -244,6 +244,14 @@ def test_no_toss_cannot_be_registered() -> None:
         register_tosses([])
 
 
+@pytest.mark.parametrize("angle", [0.0, 1e-10, 1e-7, 1.0, 2.6, 2.8, np.pi - 1e-7, np.pi])
+def test_turns_of_every_size_come_back(angle: float) -> None:
+    axis = np.array([2.0, -1.0, 2.0]) / 3
+    found = turn_between(pose_of(np.array([0, 0, 0, *angle * axis])), np.eye(4))
+    assert min(np.linalg.norm(found - angle * axis), np.linalg.norm(found + angle * axis)) < 1e-6
+    assert np.linalg.norm(found) == pytest.approx(angle, abs=1e-6)
+
+
 def test_turns_between_poses_are_their_rotation() -> None:
     a, b = pose_of(np.zeros(6)), pose_of(np.array([0, 0, 0, 0.1, 0.2, -0.3]))
     np.testing.assert_allclose(turn_between(b, a), [0.1, 0.2, -0.3], atol=1e-12)
