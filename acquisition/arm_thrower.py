@@ -18,7 +18,7 @@ from recordings.geometry import Transform, rotation_exp
 from recordings.progress import Progress
 from recordings.tracks import RigCalibration
 
-TRIES = 50
+TRIES = 12
 MOVES_WITHIN_S = 30.0
 GRASP_SPEED_M_S = 0.05
 DRY_OPENINGS = 10

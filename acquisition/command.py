@@ -10,7 +10,7 @@ import shutil
 import sys
 import time
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -40,6 +40,9 @@ def run(args: argparse.Namespace) -> Outcome:
     if args.tosses < 1:
         raise BadInput(f"--tosses {args.tosses}; wanted 1 or more")
     setup = set_up(args.rig)
+    if args.between:
+        config = replace(setup.rig.recording, between_tosses=True)
+        setup = replace(setup, rig=replace(setup.rig, recording=config))
     operator: Operator = Nobody() if args.yes else Keyboard()
     if args.dry_run:
         return _dry_run(setup, args.tosses, operator)

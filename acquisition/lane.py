@@ -60,7 +60,6 @@ class Lane:
         self.counter = Counter()
         self.last_host_ns = time.monotonic_ns()
         self.take: Take | None = None
-        self.keep_all = False
         self._queue: BoundedQueue[Item] = BoundedQueue(max(int(queue_s * rate_hz), 4))
         self._ring: deque[Item] = deque()
         self._left_ns = 0
@@ -123,7 +122,7 @@ class Lane:
                     return
                 self._ring.popleft()
                 self._put(take, item)
-            elif self.keep_all or now_ns - item.host_ns <= self._ring_ns:
+            elif now_ns - item.host_ns <= self._ring_ns:
                 return
             else:
                 self._ring.popleft()

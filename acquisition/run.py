@@ -77,6 +77,14 @@ class SessionReport:
         return sum(t.decision == "accept" for t in self.takes)
 
 
+@dataclass(frozen=True, eq=False)
+class Opened:
+    """A take's file, and the counts when it was opened."""
+
+    writer: TossWriter
+    before: Mapping[str, Tally]
+
+
 class SessionRun:
     """One session being recorded."""
 
@@ -105,11 +113,13 @@ class SessionRun:
         attempt, rejected, toss = 0, 0, options.first_toss
         while toss < options.first_toss + options.tosses and not report.stopped:
             check_disk(self.session.folder, self._rate_bytes_s, self.config.longest_toss_s, self.config.reserve_gb)
+            opened = self._open(toss) if self.config.between_tosses else None
             plan = self.thrower.prepare(toss, attempt, self.progress)
             if self.operator.wait_for_start() == "quit":
                 report.stopped = "quit"
+                self._drop(toss, opened)
                 break
-            take = self._take(toss, plan, options.fixed_s)
+            take = self._take(toss, plan, options.fixed_s, opened)
             report.takes.append(take)
             self.operator.say(f"{toss_name(toss)}: {take.decision} ({take.verdict.text()})")
             if take.decision == "accept":
@@ -123,8 +133,8 @@ class SessionRun:
                 report.stopped = f"{toss_name(toss)} was rejected {rejected} times"
         return report
 
-    def _take(self, toss: int, plan: TossPlan | None, fixed_s: float | None) -> TossReport:
-        self._count_down()
+    def _open(self, toss: int) -> Opened:
+        """A new file, which takes what is in the rings and all that comes."""
         self.recorder.troubles()
         before = self.recorder.tallies()
         reach_ns = time.monotonic_ns() - round(self.config.pre_trigger_s * 1e9)
@@ -132,8 +142,21 @@ class SessionRun:
             reach_ns = self._ended_host_ns + 1
         with self.interrupts.shield():
             writer = self.session.toss(toss, {"clocks": self.recorder.clocks()})
-            take = _Running(self, plan, fixed_s)
             self.recorder.begin(writer, reach_ns)
+        return Opened(writer, before)
+
+    def _drop(self, toss: int, opened: Opened | None) -> None:
+        """The frames before a toss that did not come."""
+        if opened is not None:
+            with self.interrupts.shield():
+                self._close()
+                self.session.discard(toss)
+
+    def _take(self, toss: int, plan: TossPlan | None, fixed_s: float | None, opened: Opened | None) -> TossReport:
+        self._count_down()
+        opened = opened or self._open(toss)
+        writer, before = opened.writer, opened.before
+        take = _Running(self, plan, fixed_s)
         try:
             take.throw()
             ended_by = take.watch()

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
+from jaxtyping import Float
+from numpy import ndarray as Array
 
 from acquisition.synthetic import textures
 from acquisition.synthetic.objects import box
 from acquisition.synthetic.paint import Gloss, assemble
 from acquisition.synthetic.rays import Body
 from recordings.geometry import Transform, rotation_exp
+from recordings.robot import Robot, panda
 from recordings.tracks import TagPlacement
 
 COLUMNS, ROWS = 5, 4
@@ -18,6 +23,9 @@ FIRST_TAG = 100
 THICKNESS_M = 0.006
 TEXELS_PER_M = 2600.0
 MARGIN_M = 0.005
+HELD_Q_RAD = np.array([0.0, 0.1, 0.0, -1.9, 0.0, 2.4, 0.8])
+"""Joints of a Panda that holds a board up in front of itself."""
+HELD_REACH_RAD = np.array([0.25, 0.25, 0.3, 0.3, 0.7, 0.7, 0.8])
 
 
 def board_tags() -> tuple[TagPlacement, ...]:
@@ -61,3 +69,46 @@ def board_pose(rng: np.random.Generator) -> Transform:
 
 def _direction(angle: float) -> np.ndarray:
     return np.array([np.cos(angle), np.sin(angle), 0.0])
+
+
+@dataclass(frozen=True, eq=False)
+class HeldBoard:
+    """One robot pose of a hand-eye calibration: joint angles, and where the board in the gripper then is."""
+
+    q_rad: Float[Array, " j"]
+    world_from_board: Transform
+
+
+def held_board_poses(
+    world_from_base: Transform, world_from_camera: Transform, count: int, rng: np.random.Generator
+) -> tuple[Transform, list[HeldBoard]]:
+    """tool_from_board, and `count` poses of a Panda that holds the board before a fixed camera: turned by up to half a
+    right angle about several axes, always printed side to the camera and in its view."""
+    robot = panda()
+    camera_m = world_from_camera.translation_m
+    first = world_from_base @ _tool(robot, HELD_Q_RAD)
+    tool_from_board = first.inverse() @ _facing(first.translation_m, camera_m)
+    held: list[HeldBoard] = []
+    while len(held) < count:
+        q_rad = HELD_Q_RAD + rng.uniform(-1, 1, len(HELD_Q_RAD)) * HELD_REACH_RAD
+        board = world_from_base @ _tool(robot, q_rad) @ tool_from_board
+        towards = camera_m - board.translation_m
+        distance_m = float(np.linalg.norm(towards))
+        in_camera = world_from_camera.inverse().points(board.translation_m[None])[0]
+        aside = float(np.linalg.norm(in_camera[:2]) / max(in_camera[2], 1e-6))
+        if board.rotation[:, 2] @ towards > np.cos(np.deg2rad(50)) * distance_m and aside < 0.45 and distance_m > 0.35:
+            held.append(HeldBoard(q_rad, Transform("world", "board", board.rotation, board.translation_m)))
+    return tool_from_board, held
+
+
+def _tool(robot: Robot, q_rad: Float[Array, " j"]) -> Transform:
+    found = robot.links(q_rad)["panda_hand_tcp"]
+    return Transform("base", "tool", found.rotation, found.translation_m)
+
+
+def _facing(place_m: Float[Array, "3"], camera_m: Float[Array, "3"]) -> Transform:
+    """world_from_board at a place, printed side to the camera, its rows level."""
+    z = (camera_m - place_m) / np.linalg.norm(camera_m - place_m)
+    x = np.cross([0.0, 0.0, 1.0], z)
+    x /= np.linalg.norm(x)
+    return Transform("world", "board", np.stack([x, np.cross(z, x), z], 1), place_m + 0.05 * z)

@@ -213,3 +213,13 @@ def test_a_device_that_is_not_there_stops_everything_before_anything_is_written(
 def test_a_toss_that_does_not_fit_on_the_disk_is_not_begun(tmp_path: Path) -> None:
     with pytest.raises(TosslabError, match="Free some space"):
         check_disk(tmp_path / "new", 40e6, 10.0, reserve_gb=1e9)
+
+
+@pytest.mark.slow
+def test_frames_between_tosses_are_kept_on_request(record: Callable[..., Any]) -> None:
+    done = record(tosses=2, between_tosses=True)
+    assert [t.decision for t in done.report.takes] == ["accept", "accept"]
+    with Session.open(done.folder) as session:
+        before, after = session.toss(0).color(), session.toss(1).color()
+        assert after[0].index == before[len(before) - 1].index + 1
+    assert_everything_is_counted(done)

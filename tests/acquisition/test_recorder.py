@@ -22,6 +22,7 @@ from acquisition.rig import RecordingConfig
 from acquisition.streams import BoundedQueue, Counter, Tally
 from acquisition.verdict import judge
 from recordings.session import Session
+from recordings.session_writer import SessionWriter, TossWriter
 from recordings.verify import verify
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -86,6 +87,11 @@ def test_a_tally_adds_up() -> None:
     assert now.since(Tally(received=1, dropped={"duplicate": 1})).dropped == {"queue full": 3}
 
 
+@pytest.fixture
+def writer(tmp_path: Path) -> TossWriter:
+    return SessionWriter(tmp_path / "lanes", {}).toss(0)
+
+
 class Sheet:
     """A writer that remembers."""
 
@@ -99,7 +105,7 @@ class Sheet:
         return item.count
 
 
-def test_a_take_holds_the_ring_before_it_and_nothing_after_its_end() -> None:
+def test_a_take_holds_the_ring_before_it_and_nothing_after_its_end(writer: TossWriter) -> None:
     sheet = Sheet()
     lane = Lane("/x", 100.0, 5.0, 0.5, sheet.write)
     lane.start()
@@ -107,7 +113,7 @@ def test_a_take_holds_the_ring_before_it_and_nothing_after_its_end() -> None:
     for k in range(10):
         lane.offer(Item(k, now - (10 - k) * 100_000_000))  # one every 0.1 s, the last 0.1 s ago
     time.sleep(0.2)
-    take = Take(None, now - 450_000_000)  # type: ignore[arg-type]
+    take = Take(writer, now - 450_000_000)
     lane.take = take
     lane.offer(Item(10, now))
     time.sleep(0.2)
@@ -123,10 +129,10 @@ def test_a_take_holds_the_ring_before_it_and_nothing_after_its_end() -> None:
     assert tally.received == 13 == tally.written + tally.idle + 1
 
 
-def test_a_slow_writer_never_makes_the_driver_wait() -> None:
+def test_a_slow_writer_never_makes_the_driver_wait(writer: TossWriter) -> None:
     lane = Lane("/x", 100.0, 0.1, 0.5, Sheet(slow_s=0.05).write)
     lane.start()
-    lane.take = Take(None, 0)  # type: ignore[arg-type]
+    lane.take = Take(writer, 0)
     began = time.monotonic()
     for k in range(1000):
         lane.offer(Item(k, time.monotonic_ns()))
