@@ -18,6 +18,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 from jaxtyping import Bool, Float, Int64
@@ -256,5 +257,5 @@ def _damage(path: Path) -> Iterator[None]:
     """Turns what a broken file raises into DamagedFile."""
     try:
         yield
-    except (OSError, ValueError, KeyError, IndexError, EOFError) as wrong:
+    except (OSError, ValueError, KeyError, IndexError, EOFError, BadZipFile) as wrong:
         raise DamagedFile(f"{path} cannot be read ({wrong}); remove its folder and run toss-process again") from wrong

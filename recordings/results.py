@@ -18,6 +18,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
+from zipfile import BadZipFile
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -93,7 +94,7 @@ def read_track(folder: Path, toss: int) -> ObjectTrack:
                 status=tuple(CODES[CODES.index(names[s])] for s in stored["status"]),
                 covariance=stored["covariance"].astype(np.float64),
             )
-    except (OSError, ValueError, KeyError, IndexError, EOFError) as wrong:
+    except (OSError, ValueError, KeyError, IndexError, EOFError, BadZipFile) as wrong:
         raise DamagedFile(f"{path} cannot be read ({wrong}); remove its folder and run toss-process again") from wrong
 
 
