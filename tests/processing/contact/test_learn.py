@@ -162,14 +162,15 @@ def test_real_tosses_give_the_cube(real_tosses, cube_physics):
     assert learning.unexplained == {}
 
 
-def test_the_weight_lies_between_the_best_and_the_largest_within_one_standard_error():
+def test_the_weight_is_the_one_whose_rollouts_leave_surface_points_least_far_off():
     nowhere = Fit(np.zeros(1), 0.0, 0, 0, 0)
 
-    def tried(weight, errors):
-        return Candidate(weight, nowhere, np.array(errors, dtype=np.float64), np.zeros(4))
+    def tried(weight, position_m, rotation_rad):
+        return Candidate(weight, nowhere, np.full(4, position_m), np.full(4, rotation_rad))
 
-    best, close, far = tried(10.0, [1, 1, 1, 1]), tried(30.0, [1.4, 0.7, 1.2, 0.9]), tried(100.0, [2, 2, 2, 2.1])
-    assert choose([best, close, far]) is close
+    few, middle, many = tried(10.0, 0.020, 0.30), tried(30.0, 0.011, 0.32), tried(100.0, 0.010, 0.40)
+    assert choose([few, middle, many], 0.05) is middle
+    assert choose([few, middle, many], 0.0) is many
 
 
 @pytest.mark.slow
