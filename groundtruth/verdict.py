@@ -94,11 +94,14 @@ def _outstanding(values: Mapping[str, float], overall: float) -> str | None:
 
 
 def _drift(solved: Solved, calibration: RigCalibration) -> list[str]:
-    """Cameras that stand elsewhere than calibration.json says."""
+    """Cameras that stand elsewhere than calibration.json says, or of which it says nothing."""
     found = []
     for name, pose in solved.cameras.items():
         known = calibration.find("world", calibration.camera(name).frame)
         if known is None:
+            found.append(
+                f"{name} has no place in calibration.json, tags placed it; `toss-calibrate cameras` does so far better"
+            )
             continue
         apart = np.linalg.inv(known.matrix) @ pose
         shift = float(np.linalg.norm(apart[:3, 3]))
