@@ -21,6 +21,7 @@ from processing.joint_stage import joint_stage
 from processing.judge import Explained, difference, explain, pooled
 from processing.second_pass import align_stage, input_keys, second_field, second_tracks
 from processing.stage import Counts, Done
+from processing.vision import field_stage
 from recordings.geometry import rotation_angle_rad
 from recordings.results import read_masks, read_shape, read_track, write_shape
 from recordings.session_writer import write_json
@@ -183,6 +184,19 @@ def shape_change(before: Mapping[int, Done], after: Mapping[int, Done]) -> float
     return float(np.linalg.norm(nearest - new.vertices_m, axis=1).mean())
 
 
+def alone_start(run: Run, toss: int, first: Pass, alone: Done, masks: Done) -> Pass:
+    """Where the cycle begins on one toss: p_i, and O in its object frame.
+
+    A toss that is lost in P does not say how O lies in it (it may be another object's): its own shape is taken.
+    """
+    notes: tuple[str, ...] = ()
+    placed = place_stage(run, toss, first.tracks[toss], alone, first.shapes[toss])
+    if not placed.counts["frames"]:
+        placed = field_stage(run, f"toss {toss}", {toss: alone}, {toss: masks})
+        notes = (f"toss {toss} is lost among all tosses: the cycle begins with its own shape",)
+    return Pass({toss: alone}, {toss: placed}, {toss: masks}, shared_frame=False, notes=notes)
+
+
 def place_stage(run: Run, toss: int, together: Done, alone: Done, shape: Done) -> Done:
     """Stage `place`: O moved into p_i's object frame, by the motion that lays P's poses of toss i on p_i's."""
     inputs = {"together": together.key, "alone": alone.key, "shape": shape.key, "toss": str(toss)}
@@ -203,7 +217,7 @@ def placement(own: ObjectTrack, shared: ObjectTrack) -> tuple[Float[Array, "4 4"
     """
     both = np.isfinite(own.camera_from_object[:, 0, 0]) & np.isfinite(shared.camera_from_object[:, 0, 0])
     if not both.any():
-        return np.eye(4), {"frames": 0, "rotation_deg": float("nan"), "translation_m": float("nan")}
+        return np.eye(4), {"frames": 0}
     steps = np.linalg.inv(own.camera_from_object[both]) @ shared.camera_from_object[both]
     use = np.ones(len(steps), dtype=bool)
     mean = np.eye(4)

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from processing.backends import make_matcher, settings_of
 from processing.config import Config
-from processing.cycle import Pass, place_stage, run_cycle
+from processing.cycle import Pass, alone_start, run_cycle
 from processing.dynamics import rollout_stage
 from processing.frames import corrected_frames
 from processing.masks import object_masks, static_scene
@@ -190,8 +190,7 @@ def _refined_rows(
         return _with_rollouts(run, ended) if variant.icp and ended.contact else ended
     parts = []
     for toss in run.tosses:
-        moved = place_stage(run, toss, first.tracks[toss], once[toss], first.shapes[toss])
-        alone = Pass({toss: once[toss]}, {toss: moved}, {toss: masks[toss]}, shared_frame=False)
+        alone = alone_start(run, toss, first, once[toss], masks[toss])
         parts.append(run_cycle(run, variant, alone, f"toss {toss}"))
     return Pass.joined(parts)
 

@@ -96,7 +96,7 @@ class TinyWorld:
                         writer.color(self._encoded(frame))
                         raw = np.round(frame.depth_m * 1000).astype(np.uint16)
                         writer.depth(DepthImage("d455", i, frame.time_ns, frame.time_ns, 0.001, raw))
-                        if i == 0 and first_mask:
+                        if i == 0 and first_mask and mask.any():
                             writer.mask(0, mask)
             session.finish("complete")
         return folder
