@@ -29,7 +29,7 @@ LEAST_SPEED_M_S = 0.15
 GRAVITY_M_S2 = 9.81
 JERKY_M_S2 = 20.0
 """Accelerations further than this from both rest and free fall belong to an impact."""
-SEARCH_S = 0.1
+SEARCH_S, SEARCHED = 0.1, 15
 FINEST_S = 1e-6
 RIG_TURN, RIG_SHIFT_M = 0.003, 0.003
 """How far calibration may be off (standard deviations) while the offset is found."""
@@ -209,8 +209,8 @@ def _solve(
         return raw if whiten is None else np.einsum("nij,nj->ni", whiten, raw)
 
     best: tuple[float, Array] | None = None
-    for offset in np.linspace(-SEARCH_S, SEARCH_S, 21):
-        numbers = _fit(residual, np.concatenate([[offset], start]), prior, _used(reference, stamps, offset), 2, True)
+    for offset in np.linspace(-SEARCH_S, SEARCH_S, SEARCHED):
+        numbers = _fit(residual, np.concatenate([[offset], start]), prior, _used(reference, stamps, offset), 1, True)
         error = _error(residual, numbers, _used(reference, stamps, numbers[0]))
         if np.isfinite(error) and (best is None or error < best[0]):
             best = (error, numbers)
