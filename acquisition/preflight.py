@@ -211,13 +211,12 @@ def _grain(recorder: Recorder) -> dict[str, float]:
 
 def tags(recorder: Recorder, calibration: RigCalibration) -> Iterator[Row]:
     """AprilTags in every picture; those of the table where the calibration says (else a camera was moved)."""
-    from calibration.tags import detect_tags
+    from calibration.tags import TagDetection, detect_tags
 
-    images = {t: i for t, i in sorted(recorder.latest.items()) if not t.endswith("depth") and "infrared" not in t}
-    if not images:
-        return
-    greys = [i.pixels if i.pixels.ndim == 2 else cv2.cvtColor(i.pixels, cv2.COLOR_RGB2GRAY) for i in images.values()]
-    for topic, found in zip(images, detect_tags(greys, calibration.tag_family, jobs=1)):
+    found_in: dict[str, list[TagDetection]] = {}
+    for greys in of_one_size(greys_of(recorder)):
+        found_in |= dict(zip(greys, detect_tags(list(greys.values()), calibration.tag_family, jobs=1)))
+    for topic, found in found_in.items():
         name = topic.split("/")[1]
         table = {t.tag_id: t for t in calibration.table_tags}
         mine = [t for t in found if t.tag_id in table]
@@ -231,6 +230,21 @@ def tags(recorder: Recorder, calibration: RigCalibration) -> Iterator[Row]:
             state = "ok" if drift < DRIFT_PX else "warning" if drift < DRIFT_BAD_PX else "fail"
             wanted = "the camera was moved: toss-record --calibration board, then toss-calibrate cameras"
             yield Row("calibration drift", name, state, f"{drift:.2f} px on {len(off_px)} tags of the table", wanted)
+
+
+def greys_of(recorder: Recorder) -> dict[str, Array]:
+    """The latest picture of every stream that shows visible light, grey."""
+    return {
+        topic: image.pixels if image.pixels.ndim == 2 else cv2.cvtColor(image.pixels, cv2.COLOR_RGB2GRAY)
+        for topic, image in sorted(recorder.latest.items())
+        if not topic.endswith("depth") and "infrared" not in topic
+    }
+
+
+def of_one_size(greys: Mapping[str, Array]) -> Iterator[dict[str, Array]]:
+    """The same pictures, those of one size together: the tag detector takes such."""
+    for shape in sorted({grey.shape for grey in greys.values()}):
+        yield {name: grey for name, grey in greys.items() if grey.shape == shape}
 
 
 def _off_px(calibration: RigCalibration, name: str, corners_px: Mapping[int, Float[Array, "4 2"]]) -> Iterator[float]:

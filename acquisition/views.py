@@ -15,6 +15,7 @@ from numpy import ndarray as Array
 from acquisition.devices import Image
 from acquisition.interrupts import Interrupts
 from acquisition.operator import Operator
+from acquisition.preflight import of_one_size
 from acquisition.recorder import Recorder
 from acquisition.run import SessionReport
 from acquisition.setup import Setup
@@ -165,8 +166,13 @@ def _images(recorder: Recorder, names: Mapping[str, Coverage]) -> dict[str, Imag
 
 
 def _views(target: Target, images: Mapping[str, Image]) -> dict[str, TargetView]:
-    greys = [i.pixels if i.pixels.ndim == 2 else cv2.cvtColor(i.pixels, cv2.COLOR_RGB2GRAY) for i in images.values()]
-    views = dict(zip(images, find_target(target, greys)))
+    greys = {
+        name: i.pixels if i.pixels.ndim == 2 else cv2.cvtColor(i.pixels, cv2.COLOR_RGB2GRAY)
+        for name, i in images.items()
+    }
+    views: dict[str, TargetView] = {}
+    for group in of_one_size(greys):
+        views |= dict(zip(group, find_target(target, list(group.values()))))
     return {name: view for name, view in views.items() if len(view) >= FEWEST_POINTS}
 
 
