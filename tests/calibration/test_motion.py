@@ -38,7 +38,7 @@ def off(found, true):
 
 
 def arm_case(geometry, seed, mounting, turn_deg=45.0, axes=(1, 1, 1), noise=1.0):
-    """Fifteen robot poses with a board 0.5 mm and 0.1 deg off, and an arm 0.05 deg and 0.2 mm off."""
+    """Twenty robot poses with a board 0.5 mm and 0.1 deg off, and an arm 0.05 deg and 0.2 mm off."""
     rng = np.random.default_rng(seed)
     model = geometry.camera("d455", 430.0, (848, 480))
     mount = geometry.pose(
@@ -46,7 +46,7 @@ def arm_case(geometry, seed, mounting, turn_deg=45.0, axes=(1, 1, 1), noise=1.0)
     )
     held = geometry.pose(0.5 * rng.normal(size=3), [0.05, 0.02, 0.1])
     robot, views = [], []
-    for _ in range(15):
+    for _ in range(20):
         turn = rng.normal(size=3) * axes
         turn *= np.radians(turn_deg) * rng.uniform(0.5, 1) / np.linalg.norm(turn)
         facing = Rotation.from_rotvec(turn) * Rotation.from_euler("x", np.pi)
@@ -64,8 +64,11 @@ def test_the_camera_is_found_on_either_mounting(geometry, mounting):
     model, mount, held, robot, views = arm_case(geometry, 3, mounting)
     solved = calibrate_hand_eye(model, views, robot, mounting)
     mm, deg = off(solved.camera_from_mount, mount)
-    assert mm < 1.5
-    assert deg < 0.15
+    said = solved.report.uncertainty
+    assert said["position_mm"] < 1.5
+    assert said["direction_deg"] < 0.15
+    assert mm < 2.5 * said["position_mm"]
+    assert deg < 2.5 * said["direction_deg"]
     assert off(solved.held_from_board, held)[0] < 3.0
     assert solved.report.verdict == "good"
 
@@ -119,15 +122,15 @@ def test_an_offset_between_two_courses_is_found_within_its_deviation(geometry, o
     assert found.std_s < 1e-3
 
 
-def test_ten_noisy_tosses_pooled_know_the_offset_better_than_one(geometry):
+def test_noisy_tosses_pooled_know_the_offset_better_than_one(geometry):
     times, poses, at = ballistic(geometry)
     rng, each = np.random.default_rng(2), []
-    for _ in range(10):
+    for _ in range(6):
         others = 0.004 + times[:-2] + rng.uniform(0, 0.02)
         points = np.array([at(t)[:3, 3] for t in others]) + 0.003 * rng.normal(size=(len(others), 3))
         each.append(offset_of_paths(Path3.of_poses(times, poses), Path3(others - 0.005, points)))
     together = pooled(each)
-    assert together.std_s < 0.5 * np.median([e.std_s for e in each])
+    assert together.std_s < 0.6 * np.median([e.std_s for e in each])
     assert abs(together.offset_s - 0.005) < 3 * together.std_s
     assert 0.3 < np.sqrt(np.mean([((e.offset_s - 0.005) / e.std_s) ** 2 for e in each])) < 2.0
 
@@ -143,7 +146,7 @@ def test_an_offset_from_tag_corners_is_found_to_a_fraction_of_a_millisecond(geom
     times, poses, at = ballistic(geometry)
     model = geometry.camera("d455", 500.0, (848, 640))
     camera = geometry.pose([np.pi, 0, 0], [-0.1, 0.1, 1.5])
-    frames = corner_frames(geometry, model, camera, at, times[2:-4] + 0.009, 0.0062, np.random.default_rng(3))
+    frames = corner_frames(geometry, model, camera, at, times[2:-4:2] + 0.009, 0.0062, np.random.default_rng(3))
     course = Path3.of_poses(times, poses)
     crooked = geometry.pose([0.001, -0.001, 0.0005], [0.001, 0.001, -0.002]) @ camera
     found = offset_of_corners(course, model, crooked, frames)
@@ -237,7 +240,7 @@ def test_gravity_comes_out_of_free_flight_of_a_point_off_the_centre(geometry):
     course = Path3.of_poses(times, carried)
     flight = find_flight(course, 0.25)
     assert flight.start >= 8
-    assert flight.stop <= 24
+    assert flight.stop <= 24 or flight.start >= 22  # before the bounce or after it, never across
     found = gravity_from_flight(course, flight)
     assert np.degrees(np.arccos(-found.down[2])) < max(0.5, 3 * found.std_deg)
     assert found.size_m_s2 == pytest.approx(9.81, rel=0.02)
@@ -248,5 +251,5 @@ def test_gravity_comes_out_of_free_flight_of_a_point_off_the_centre(geometry):
 
 
 def test_poses_exponential_and_logarithm_undo_each_other():
-    rows = np.random.default_rng(8).normal(size=(20, 6))
+    rows = np.random.default_rng(8).uniform(-1.5, 1.5, (20, 6))
     np.testing.assert_allclose(log_poses(exp_poses(rows)), rows, atol=1e-9)
