@@ -60,11 +60,30 @@ def _parser() -> Parser:
     parser.add_argument(
         "--executor", choices=("local", "slurm"), default="local", help="where several sessions run (local processes)"
     )
+    add_cycle_arguments(parser)
     add_masks_argument(parser)
     backends.add_arguments(parser)
     import_module(CONTACT).add_arguments(parser)
     parser.set_defaults(work=_work)
     return parser
+
+
+def add_cycle_arguments(parser: argparse.ArgumentParser) -> None:
+    """What the second pass is given; `anew` and `rendered` are the paper's way."""
+    group = parser.add_argument_group("second pass")
+    group.add_argument(
+        "--second-pass", choices=("shape", "poses", "anew"), default="shape",
+        help="start from the first pass's poses and shape (default), its poses, or the first pose alone (the paper)",
+    )  # fmt: skip
+    group.add_argument(
+        "--redraw", choices=("filled", "rendered"), default="filled",
+        help="depth: the camera's own, filled by the shape's (default), or the shape's everywhere (the paper)",
+    )  # fmt: skip
+    group.add_argument(
+        "--occlusion", choices=("fill", "subtract"), default="fill",
+        help="what stands in front of the shape is filled (the paper's text) or cut out (its authors' code)",
+    )  # fmt: skip
+    group.add_argument("--renderer", choices=("raycast", "drake"), default="raycast", help="drake needs the extra sim")
 
 
 def _work(args: argparse.Namespace) -> Outcome:
@@ -199,8 +218,12 @@ def learned_shape_of(results_path: Path) -> Path:
 def config_of(args: argparse.Namespace) -> Config:
     """The pipeline's settings that the command line asks for; everything else stays as it is by default."""
     from processing.config import Config
+    from processing.reprojected import RedrawConfig
+    from processing.second_pass import CycleConfig
 
-    return Config(given_masks=args.masks, backends=backends.chosen(args))
+    redraw = RedrawConfig(depth=args.redraw, occlusion=args.occlusion)
+    cycle = CycleConfig(redraw=redraw, renderer=args.renderer, start=args.second_pass)
+    return Config(given_masks=args.masks, backends=backends.chosen(args), cycle=cycle)
 
 
 def _evaluate(args: argparse.Namespace, session: Session, out: Path, run: Run) -> Outcome:

@@ -19,7 +19,7 @@ from processing.dynamics import contact_stage
 from processing.icp import ShapeSurface
 from processing.joint_stage import joint_stage
 from processing.judge import Explained, difference, explain, pooled
-from processing.second_pass import align_stage, input_keys, second_field, second_tracks
+from processing.second_pass import CycleConfig, align_stage, input_keys, second_field, second_tracks
 from processing.stage import Counts, Done
 from processing.vision import field_stage
 from recordings.geometry import rotation_angle_rad
@@ -71,7 +71,18 @@ def run_cycle(run: Run, variant: Variant, start: Pass, name: str) -> Pass:
         return refined
     ended = second_pass(run, refined, start.masks, name, variant.icp)
     told = _told(run, start, ended, start.masks, name)
-    return replace(ended, passes=(told,), notes=(*ended.notes, *_said(told)))
+    return replace(ended, passes=(told,), notes=(*ended.notes, *_said(told), *departures(run.config.cycle)))
+
+
+def departures(config: CycleConfig) -> tuple[str, ...]:
+    """Where the second pass is not the paper's, and how to have the paper's."""
+    starts = {"poses": "starts from the first pass's poses", "shape": "starts from the first pass's poses and shape"}
+    notes = []
+    if config.start != "anew":
+        notes.append(f"second pass: {starts[config.start]} (the paper starts anew: --second-pass anew)")
+    if config.redraw.depth != "rendered":
+        notes.append("second pass: measured depth stays where it agrees (the paper draws all: --redraw rendered)")
+    return tuple(notes)
 
 
 def with_contact(run: Run, start: Pass, name: str) -> Pass:

@@ -39,7 +39,7 @@ class CycleConfig:
     redraw: RedrawConfig = field(default_factory=RedrawConfig)
     judge: JudgeConfig = field(default_factory=JudgeConfig)
     renderer: RendererName = "raycast"
-    start: Start = "poses"
+    start: Start = "shape"
     """`anew` (the paper): the second pass is given the first pose only. `poses`: the poses at which the shape was drawn
     are refined, only lost frames are sought. `shape`: the same, and the shape's own surface and colours take part."""
     worse_share: float = 0.005

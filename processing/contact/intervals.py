@@ -168,3 +168,23 @@ def _row_losses(
     for part in (step_terms(data, body, impulses, contacts), idle_terms(data, body, impulses, contacts)):
         out[part.rows] = part.total(weights)
     return (out * data.weight).cpu().numpy()
+
+
+def plane_sensitivity(
+    fitted: Model, optimum: Float[Array, " p"], data: StepData, weights: Weights, shift_m: float = 0.001
+) -> dict[str, float]:
+    """What the learned numbers do when the plane is 1 mm higher: metres (or friction) per metre."""
+    low = data.rows(torch.arange(len(data), device=data.weight.device))
+    low.position_m = data.position_m - data.position_m.new_tensor([0.0, 0.0, shift_m])
+    moved = fit(fitted, optimum, low, weights, 0.3).parameters
+
+    def size(parameters: Float[Array, " p"]) -> Float[Array, "3"]:
+        return extents(fitted.numbers(parameters).points_m.cpu().numpy())
+
+    change = (size(moved) - size(optimum)) / shift_m
+    friction = float(moved[FRICTION] ** 2 - optimum[FRICTION] ** 2) / shift_m
+    return {
+        "mean_extent_m_per_m": float(change.mean()),
+        "largest_extent_m_per_m": float(change[np.abs(change).argmax()]),
+        "friction_per_m": friction,
+    }

@@ -12,10 +12,10 @@ from jaxtyping import Bool, Float
 from numpy import ndarray as Array
 
 from processing.contact import data_checks as checks
-from processing.contact.fit import FRICTION, Fit, FitConfig, Model, fit
+from processing.contact.fit import Fit, FitConfig, Model, fit
 from processing.contact.geometry import GeometryName
 from processing.contact.inertia import Physics
-from processing.contact.intervals import Interval, Spread, bootstrap, curvature, extents
+from processing.contact.intervals import Interval, Spread, bootstrap, curvature, extents, plane_sensitivity
 from processing.contact.loss import REFERENCE_MASS_KG, Body, StepData, Weights, contact_loss
 from processing.contact.motion import GRAVITY_M_S2, PoseSeries, States, Steps, differences, steps_of
 from processing.contact.prior import Frame, Prior, learned_shape
@@ -334,26 +334,6 @@ def _spread(
     if tosses < 2 or config.bootstrap_repeats < 2:
         return curvature(fitted, optimum, data, weights)
     return bootstrap(fitted, optimum, data, weights, config.bootstrap_repeats, config.seed)
-
-
-def plane_sensitivity(
-    fitted: Model, optimum: Float[Array, " p"], data: StepData, weights: Weights, shift_m: float = 0.001
-) -> dict[str, float]:
-    """What the learned numbers do when the plane is 1 mm higher: metres (or friction) per metre."""
-    low = data.rows(torch.arange(len(data), device=data.weight.device))
-    low.position_m = data.position_m - data.position_m.new_tensor([0.0, 0.0, shift_m])
-    moved = fit(fitted, optimum, low, weights, 0.3).parameters
-
-    def size(parameters: Float[Array, " p"]) -> Float[Array, "3"]:
-        return extents(fitted.numbers(parameters).points_m.cpu().numpy())
-
-    change = (size(moved) - size(optimum)) / shift_m
-    friction = float(moved[FRICTION] ** 2 - optimum[FRICTION] ** 2) / shift_m
-    return {
-        "mean_extent_m_per_m": float(change.mean()),
-        "largest_extent_m_per_m": float(change[np.abs(change).argmax()]),
-        "friction_per_m": friction,
-    }
 
 
 def touched_points(fitted: Model, body: Body, data: StepData, weights: Weights) -> Bool[Array, " v"]:
