@@ -37,7 +37,7 @@ def run(
     return mapper, np.array(errors)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_drifting_clock_under_load_is_mapped_to_a_twentieth_of_a_millisecond(seed: int) -> None:
     mapper, error_ms = run(seed)
     assert error_ms[300:].std() < 0.05  # from ten seconds on
@@ -86,7 +86,7 @@ def test_another_stamp_of_the_same_clock_is_put_beside_the_last_one() -> None:
 
 
 @pytest.mark.parametrize("by_ns", [3e6, -3e6, 20e6, -20e6, 5e8, -5e8, 3.6e12, -3.6e12])
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_a_step_of_the_device_clock_is_seen_and_measured(seed: int, by_ns: float) -> None:
     mapper, error_ms = run(100 + seed, seconds=20, step=(300, by_ns))
     assert len(mapper.steps) == 1

@@ -86,7 +86,7 @@ def test_a_planned_toss_passes_its_release_with_its_velocity_and_keeps_it(model:
 @pytest.mark.parametrize("name", ARMS)
 def test_every_accepted_plan_stays_within_the_limits(name: str) -> None:
     model, rng, accepted = arm_model(name), np.random.default_rng(1), 0
-    for _ in range(12):
+    for _ in range(6):
         config = replace(CALM, velocity_m_s=tuple(rng.uniform([-0.5, -1.0, -0.2], [0.5, 0.1, 0.8]).tolist()))
         try:
             plan = plan_toss(model, BASE, draw_target(config, 0), DELAY)
@@ -99,7 +99,7 @@ def test_every_accepted_plan_stays_within_the_limits(name: str) -> None:
         assert np.abs(t.dq_rad_s[[0, -1]]).max() < 1e-9
         gaps, _ = Batch(model).clearances(t.q_rad[::20])
         assert gaps.min() > 0.0
-    assert accepted >= 4
+    assert accepted >= 2
 
 
 @pytest.mark.parametrize(
@@ -110,7 +110,11 @@ def test_every_accepted_plan_stays_within_the_limits(name: str) -> None:
             r"velocity of panda_joint\d at .* rad/s, allowed are .* \(0.9 of the limit\)",
         ),
         ({"position_m": (0.0, -2.0, 0.3)}, "no joint angles of the panda reach the release pose"),
-        ({"position_m": (0.0, 0.1, 0.03)}, "(height|distance) of panda_.* at least .* is wanted"),
+        pytest.param(
+            {"position_m": (0.0, 0.1, 0.03)},
+            "(height|distance) of panda_.* at least .* is wanted",
+            marks=pytest.mark.slow,
+        ),
     ],
 )
 def test_a_toss_that_cannot_be_is_refused_with_what_stands_in_the_way(change: dict, says: str) -> None:
