@@ -82,7 +82,7 @@ class Graph:
     arcs: list[Arc] = field(default_factory=list)
 
     def add_pose(self, name: str, start: Float[Array, "4 4"], stamp_ns: int | None) -> int:
-        """`stamp_ns` is None for what does not move: such poses are eliminated last, everything else in time order."""
+        """`stamp_ns` is None for what does not move: such poses are eliminated last (see elimination_order)."""
         self.names.append(name)
         self.stamps.append(stamp_ns)
         self.start.append(np.asarray(start, dtype=np.float64))
@@ -142,9 +142,16 @@ def covariances(solution: Solution, poses: Sequence[int]) -> Float[Array, "k 6 6
 
 
 def elimination_order(graph: Graph) -> Int[Array, " d"]:
-    """Unknowns in the order of elimination: by time, what does not move last. No fill but in the last rows."""
-    stamps = np.array([np.iinfo(np.int64).max if s is None else s for s in graph.stamps], dtype=np.int64)
-    poses = np.argsort(stamps, kind="stable")
+    """Unknowns in the order of elimination. What does not move comes last. Of what moves, every second stamp comes
+    first, then every second one of the rest, and so on: a chain of odometry taken from its end would drag along all tags
+    that it ever saw, and a frame would cost the more the later it is. Within a stamp, what was added last (a camera's
+    own pose) hangs on what was added first (its rig), so it goes first.
+    """
+    last = np.iinfo(np.int64).max
+    stamps = np.array([last if s is None else s for s in graph.stamps], dtype=np.int64)
+    rank = np.searchsorted(np.unique(stamps), stamps) + 1
+    level = np.where(stamps == last, 64, np.log2(rank & -rank))
+    poses = np.lexsort((-np.arange(len(stamps)), stamps, level))
     return (6 * poses[:, None] + np.arange(6)).ravel()
 
 
