@@ -70,7 +70,7 @@ def align_stage(
             track = read_track(tracks[toss].folder, toss)
             if icp:
                 track, counts, details = _laid_on_depth(run, toss, track, body, masks[toss])
-                total = {k: total.get(k, 0) + v for k, v in counts.items()}
+                total = {k: total.get(k, 0) + counts.get(k, 0) for k in (*total, *counts)}
                 np.savez(folder / f"toss_{toss:02d}.icp.npz", **details)
             write_track(folder, track)
             second = second_frames(run, toss, track, body, masks[toss])
