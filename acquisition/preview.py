@@ -35,6 +35,12 @@ class Preview:
         self._thread.join(2.0)
         self.view.__exit__(kind, error, trace)
 
+    def picture(self) -> bytes:
+        """A PNG of the viewer's window; what is shown stays as it is from here on."""
+        self._stop.set()
+        self._thread.join(2.0)
+        return self.view.picture()
+
     def _run(self) -> None:
         shown: dict[str, int] = {}
         while not self._stop.wait(EVERY_S):

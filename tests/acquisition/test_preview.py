@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -20,7 +18,7 @@ from recordings.view_viewer import ViewerFailed
 
 
 @pytest.mark.slow
-def test_a_picture_of_every_stream_is_in_the_viewer(record: Callable[..., Any]) -> None:
+def test_a_picture_of_every_stream_is_in_the_viewer(tmp_path: Path) -> None:
     lab = SyntheticLab(SyntheticConfig(pictures="pool", color_size=(212, 120), mono_size=(160, 120), mono_cameras=1))
     SyntheticThrower(lab).prepare(0, 0, Silent())
     entries = (DeviceEntry("d455", "rgbd", "synthetic"), DeviceEntry("mono0", "mono", "synthetic"))
@@ -28,7 +26,8 @@ def test_a_picture_of_every_stream_is_in_the_viewer(record: Callable[..., Any]) 
     recorder = Recorder(Rig("r", entries, Path("r.toml")), devices, SessionClock(time.monotonic_ns(), time.time_ns()))
     with recorder, Preview(recorder, headless=True) as preview:
         time.sleep(2.0)
-        picture = preview.view.picture()
+        picture = preview.picture()
+    (tmp_path / "preview.png").write_bytes(picture)
     assert picture.startswith(b"\x89PNG")
     assert len(picture) > 20_000  # an empty window is smaller
 
