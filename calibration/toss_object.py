@@ -54,15 +54,15 @@ class SolvedToss:
 
 def solve_toss(session: Session, number: int, args: argparse.Namespace, progress: Progress) -> SolvedToss:
     """The object's tags in the mono cameras, whose places must be known. Raises BadInput where that cannot be."""
-    tags = read_toss_tags(session, number, store.work_folder(session), progress)
-    cameras = mono_cameras(session, list(tags.tags))
-    places = camera_from_rig(session.calibration, cameras, COLOR)
+    places = camera_from_rig(session.calibration, mono_cameras(session, session.toss(number).cameras()), COLOR)
     if not places:
         raise BadInput(
             f"toss {number}: no mono camera whose place is known; first `toss-calibrate cameras {session.path}`"
         )
+    asked = tag_ids(args)
+    tags = read_toss_tags(session, number, store.work_folder(session), progress)
     fixed = table_target(session.calibration)
-    of_object = tags.of_object(tag_ids(args), fixed)
+    of_object = tags.of_object(asked, fixed)
     models = {c: session.calibration.cameras[c] for c in places}
     sightings, times_ns = triggered(tags, of_object, list(places))
     if not any(t for lists in sightings.values() for t in lists):

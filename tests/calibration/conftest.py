@@ -73,6 +73,7 @@ def geometry():
 @pytest.fixture(scope="session")
 def cube_session(data, tmp_path_factory):
     """cube_dev's first toss, its mono cameras and its calibration views as a session."""
+    from calibration.cli import main
     from recordings.importers.folder import import_folder
 
     source, folder = data("cube_dev"), tmp_path_factory.mktemp("cube")
@@ -81,6 +82,7 @@ def cube_session(data, tmp_path_factory):
     for name in ("session.json", "toss_00", "calibration", "mono/cameras.json", "mono/toss_00"):
         (layout / name).symlink_to(source / name)
     import_folder(layout, folder / "cube")
+    main(["cameras", str(folder / "cube"), "--dry-run", "--json"])  # finds the board's tags once for all tests
     return folder / "cube"
 
 

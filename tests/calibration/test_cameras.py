@@ -82,6 +82,7 @@ def test_a_camera_that_shares_no_view_is_named(geometry, rig):
         calibrate_cameras(rig[0], views, "d455")
 
 
+@pytest.mark.slow
 def test_the_tables_tags_give_the_scale_of_a_board_printed_too_large(geometry, rig):
     models, world_from, boards = rig
     board = geometry.board
@@ -113,6 +114,7 @@ def test_the_tables_tags_give_the_scale_of_a_board_printed_too_large(geometry, r
     assert any("100.4" in reason for reason in tied.report.reasons())
 
 
+@pytest.mark.slow
 def test_a_lens_is_found_with_its_distortion_and_the_simplest_model_is_taken(geometry):
     rng = np.random.default_rng(4)
     bent = geometry.camera("mono0", 620.0, distortion_model="brown-conrady", distortion=(-0.25, 0.08, 4e-4, -3e-4, 0.0))
@@ -137,6 +139,7 @@ def test_few_views_in_one_place_are_doubted_for_coverage_and_tilt(geometry):
     assert "upper left" in said
 
 
+@pytest.mark.slow
 def test_a_view_with_wrong_corners_is_left_out_of_the_lens(geometry):
     rng = np.random.default_rng(6)
     model = geometry.camera("mono0")

@@ -122,6 +122,7 @@ def test_an_offset_between_two_courses_is_found_within_its_deviation(geometry, o
     assert found.std_s < 1e-3
 
 
+@pytest.mark.slow
 def test_noisy_tosses_pooled_know_the_offset_better_than_one(geometry):
     times, poses, at = ballistic(geometry)
     rng, each = np.random.default_rng(2), []

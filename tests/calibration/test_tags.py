@@ -65,6 +65,7 @@ def test_covariances_say_how_far_corners_are_off_in_noisy_pictures():
     assert 0.5 < squares.mean() < 1.6
 
 
+@pytest.mark.slow
 def test_fitted_edges_beat_the_detector_in_sharp_and_in_blurred_pictures():
     child = DetectorChild("tag36h11", 1.0)
     for blur_px in (0.0, 2.0, 4.0):
@@ -130,6 +131,7 @@ def test_found_tags_come_from_the_cache_and_a_damaged_cache_is_made_anew(tmp_pat
     assert len(detect_tags(images, cache=tmp_path, jobs=1)[1]) == 1
 
 
+@pytest.mark.slow
 def test_a_wrong_family_and_mirrored_pictures_are_named():
     other = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_25h9)
     foreign = [drawn(k, 60.0, k, family=other)[0] for k in range(3)]
