@@ -25,6 +25,9 @@ class FlagConfig:
     gap_sigma_rad: float = 0.15
     gap_sigma_m: float = 0.02
     """Standard deviation of an interpolated pose in the middle of the longest gap."""
+    correlated: float = 3.0
+    """Covariances of the joint refinement times this: its residuals share more noise than it knows (shading, the depth
+    sensor's fixed pattern). From the normalised errors on simulated variety."""
     rival_cost: float = 0.0015
     """Another story of the same frames that fits worse by this much counts half as evidence of doubt."""
     unsure_deg: float = 25.0

@@ -329,7 +329,7 @@ def _told(
     cost, on = (figure[:n] for figure in per_view(joint.pairs, joint.figures, len(scene.store)))
     lost = ~best.use | (cost > config.flags.tracked_cost)
     lost[first] &= not best.fixed[first]
-    twists = joint.covariance[:n]
+    twists = config.flags.correlated * joint.covariance[:n]
     for other in stories[1:]:
         apart = other.badness - best.badness
         twists = twists + doubt(joint.poses[:n], other.joint.poses[:n], apart, config.flags)
