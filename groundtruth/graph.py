@@ -143,9 +143,9 @@ def covariances(solution: Solution, poses: Sequence[int]) -> Float[Array, "k 6 6
 
 def elimination_order(graph: Graph) -> Int[Array, " d"]:
     """Unknowns in the order of elimination. What does not move comes last. Of what moves, every second stamp comes
-    first, then every second one of the rest, and so on: a chain of odometry taken from its end would drag along all tags
-    that it ever saw, and a frame would cost the more the later it is. Within a stamp, what was added last (a camera's
-    own pose) hangs on what was added first (its rig), so it goes first.
+    first, then every second one of the rest, and so on: a chain of odometry taken from its end would drag along all
+    tags that it ever saw, and a frame would cost the more the later it is. Within a stamp, what was added last (a
+    camera's own pose) hangs on what was added first (its rig), so it goes first.
     """
     last = np.iinfo(np.int64).max
     stamps = np.array([last if s is None else s for s in graph.stamps], dtype=np.int64)

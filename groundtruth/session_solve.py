@@ -15,10 +15,10 @@ from jaxtyping import Bool, Float, Int64
 from numpy import ndarray as Array
 
 from groundtruth import se3
-from groundtruth.factors import Arc, Between
+from groundtruth.factors import Between
+from groundtruth.flight import FlightConfig, Order, arcs_of, center_of_mass
 from groundtruth.graph import Graph, Solution, SolverConfig, Undetermined, covariances, solve
 from groundtruth.grow import Growth, chain
-from groundtruth.interpolate import GRAVITY_M_S2
 from groundtruth.problem import Key, Observation, Problem, camera_key, planar_poses, tag_key
 from groundtruth.session_sightings import Roles, Sightings, TagSeen
 from groundtruth.tag_slam import TagSlamSettings, build_graph, grow
@@ -47,13 +47,7 @@ class SolveConfig:
     huber_px: float = 3.0
     flat_deg: float = 12.0
     """Tags seen flatter than this start nothing; their corners count."""
-    fall_m_s2: float = 0.6
-    """How far from gravity the acceleration of flight may be; beyond three times this an arc hardly counts."""
-    turn_rad_s2: float = 6.0
-    center_sigma_m: float = 0.02
-    """Of the centre of mass about the middle of the tags."""
-    rounds: int = 3
-    """Of the arcs' robust weights."""
+    flight: FlightConfig = field(default_factory=FlightConfig)
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,9 +119,9 @@ def solve_session(
     solution = solve(graph, settings.solver)
     middle = np.mean([solution.poses[index[tag_key(i)]][:3, 3] for i in roles.body if tag_key(i) in index], axis=0)
     center = middle
-    for _ in range(config.rounds):
-        center = _center_of_mass(solution.poses, order, middle, config)
-        graph.arcs = _arcs(solution.poses, order, center, config)
+    for _ in range(config.flight.rounds):
+        center = center_of_mass(solution.poses, order, middle, config.flight)
+        graph.arcs = arcs_of(solution.poses, order, center, config.flight)
         if not graph.arcs:
             break
         graph.start = list(solution.poses)
@@ -219,10 +213,6 @@ def _observations(sightings: Sightings, config: TagSlamConfig, settings: SolveCo
     return tuple(out)
 
 
-Order = Mapping[int, tuple[Array, Array]]
-"""Per toss: times (ns) and the numbers of the body's poses at them."""
-
-
 def _order(sightings: Sightings, index: Mapping[Key, int]) -> Order:
     toss_of = {s.time_ns: s.toss for s in sightings.seen}
     found: dict[int, list[tuple[int, int]]] = {toss: [] for toss in sightings.frames}
@@ -253,66 +243,6 @@ def _let_cameras_drift(
             drifting[(camera, toss)] = number
         graph.projections[i] = replace(p, rig_from_camera=drifting[(camera, toss)])
     return drifting
-
-
-def _center_of_mass(
-    poses: Float[Array, "n 4 4"], order: Order, middle: Float[Array, "3"], config: SolveConfig
-) -> Float[Array, "3"]:
-    """c with p + R c falling: second differences of p + R c equal gravity in all triples that are nearly in flight
-    (robust linear least squares), and c is near the middle of the tags, as far as flight does not tell."""
-    rows, values = [], []
-    for times, numbers in order.values():
-        for k in range(1, len(numbers) - 1):
-            h1, h2 = np.diff(times[k - 1 : k + 2]) / 1e9
-            if max(h1, h2) > 0.1:
-                continue
-            shares = np.array([2 / (h1 * (h1 + h2)), 0.0, 2 / (h2 * (h1 + h2))])
-            shares[1] = -shares.sum()
-            three = poses[numbers[k - 1 : k + 2]]
-            rows.append(np.einsum("i,ijk->jk", shares, three[:, :3, :3]))
-            values.append(GRAVITY_M_S2 - shares @ three[:, :3, 3])
-    center = middle
-    if not rows:
-        return center
-    A, b = np.array(rows), np.array(values)
-    for _ in range(20):
-        left = np.linalg.norm(b - A @ center, axis=1)
-        weight = 1 / (1 + (left / (2.5 * config.fall_m_s2)) ** 2) ** 2 / config.fall_m_s2**2
-        near = 1 / config.center_sigma_m**2
-        information = np.einsum("n,nij,nik->jk", weight, A, A) + near * np.eye(3)
-        center = np.linalg.solve(information, np.einsum("n,nij,ni->j", weight, A, b) + near * middle)
-    return center
-
-
-def _arcs(poses: Float[Array, "n 4 4"], order: Order, center: Float[Array, "3"], config: SolveConfig) -> list[Arc]:
-    """All triples of poses in a row, weighted by how nearly they are in flight (Geman and McClure)."""
-    arcs = []
-    for times, numbers in order.values():
-        h = np.diff(times) / 1e9
-        for k in range(1, len(numbers) - 1):
-            if max(h[k - 1], h[k]) > 0.1:
-                continue
-            three = (int(numbers[k - 1]), int(numbers[k]), int(numbers[k + 1]))
-            fall, turn = _off_arc(poses, three, (float(h[k - 1]), float(h[k])), center)
-            weight = 1 / (1 + (fall / (3 * config.fall_m_s2)) ** 2) ** 2
-            turn_weight = 1 / (1 + (turn / (3 * config.turn_rad_s2)) ** 2) ** 2
-            both = min(weight, turn_weight)
-            if both > 0.02:
-                steps = (float(h[k - 1]), float(h[k]))
-                arcs.append(Arc(three, steps, center, GRAVITY_M_S2, config.fall_m_s2, config.turn_rad_s2, both, both))
-    return arcs
-
-
-def _off_arc(
-    poses: Float[Array, "n 4 4"], three: tuple[int, int, int], h: tuple[float, float], center: Float[Array, "3"]
-) -> tuple[float, float]:
-    """How far a triple's acceleration is from gravity (m/s^2) and its turn from even (rad/s^2)."""
-    x = poses[list(three), :3, 3] + poses[list(three), :3, :3] @ center
-    R = poses[list(three), :3, :3]
-    spins = se3.log(se3.rotations(np.swapaxes(R[:2], -1, -2) @ R[1:]))[:, :3] / np.array(h)[:, None]
-    acceleration = 2 * ((x[2] - x[1]) / h[1] - (x[1] - x[0]) / h[0]) / sum(h)
-    fall = float(np.linalg.norm(acceleration - GRAVITY_M_S2))
-    return fall, float(np.linalg.norm(spins[1] - spins[0])) * 2 / sum(h)
 
 
 def _solved(
