@@ -75,8 +75,8 @@ class Recorder:
         self.rig, self.clock = rig, clock
         self.devices = dict(devices)
         self.lanes: dict[str, Lane] = {}
-        self.looks: deque[Look] = deque(maxlen=600)
-        self.arm_tail: deque[ArmSamples] = deque(maxlen=2000)
+        self.looks: deque[Look] = deque(maxlen=150)
+        self.arm_tail: deque[ArmSamples] = deque(maxlen=500)
         self.widths: deque[GripperSample] = deque(maxlen=4000)
         self.latest: dict[str, Image] = {}
         self._troubles: deque[Trouble] = deque(maxlen=1000)

@@ -115,9 +115,11 @@ def assert_everything_is_counted(done: Any) -> None:
 
 @pytest.mark.slow
 def test_a_camera_that_comes_back_serves_the_next_take(record: Callable[..., Any]) -> None:
-    done = record(lambda lab: lab.faults("mono0").inject("unplug", at_s=0.3, for_s=0.1), tosses=2, redo_at_most=3)
-    assert [t.decision for t in done.report.takes] == ["reject", "accept", "accept"]
-    assert [t.toss for t in done.report.takes] == [0, 0, 1]
+    done = record(lambda lab: lab.faults("mono0").inject("unplug", at_s=0.3, for_s=0.4), tosses=2, redo_at_most=3)
+    decisions = [t.decision for t in done.report.takes]
+    assert decisions[0] == "reject"  # perhaps the next one too, until the camera is back
+    assert decisions[-2:] == ["accept", "accept"]
+    assert [t.toss for t in done.report.takes][-2:] == [0, 1]
     assert_everything_is_counted(done)
 
 
