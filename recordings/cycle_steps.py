@@ -7,7 +7,8 @@ older run, stages that were removed) is left out.
 ```
 <reproject>/toss_XX.icp.npz   verdict, fitness, rmse_m, held (n): how the shape was laid onto the raw depth
 <judge>/residuals.npz         rows (toss, position, depth_m, mask, color): how well a pass explains the raw images
-<contact>/rollouts.npz        toss; toss_XX.world_from_object (t, 4, 4), toss_XX.time_s (t) since the toss's first frame
+<contact>/rollouts.npz        toss; toss_XX.world_from_object (t, 4, 4), toss_XX.time_s (t) since its first frame;
+                              beside it in the stage `rollout`, on the last poses
 ```
 """
 
@@ -120,7 +121,7 @@ class _Reader:
         chain = self._chain(toss, track, shape)
         contact = self._contact_of(toss, chain)
         steps = [self._step(toss, i, chain, contact) for i in range(len(chain))]
-        return TossCycle(tuple(steps), self._rollout(toss, contact[-1], steps[-1].track))
+        return TossCycle(tuple(steps), self._rollout(toss, contact[-1], shape, steps[-1].track))
 
     def _chain(self, toss: int, track: str, shape: str | None) -> list[_Names]:
         """Stage names of the passes, the first one first."""
@@ -192,16 +193,17 @@ class _Reader:
                 return Judged(mine[:, 1].astype(np.int64), mine[:, 2], mine[:, 3], mine[:, 4])
         return None
 
-    def _rollout(self, toss: int, contact: str | None, track: ObjectTrack) -> Rollout | None:
-        if contact is None or len(track.time_ns) == 0:
-            return None
-        path = self._results.path / contact / "rollouts.npz"
-        values, name = self._read(path), f"toss_{toss:02d}"
-        if f"{name}.time_s" not in values:
-            return None
-        with _damage(path):
-            time_ns = int(track.time_ns[0]) + np.round(1e9 * values[f"{name}.time_s"]).astype(np.int64)
-            return Rollout(time_ns, values[f"{name}.world_from_object"], self._shape(contact))
+    def _rollout(self, toss: int, contact: str | None, shape: str | None, track: ObjectTrack) -> Rollout | None:
+        """The rollout on the last poses, where the last toss was not learned from; else what contact learning kept."""
+        for stage, body in ((self._record.extra.get("rollout"), shape), (contact, contact)):
+            path = self._results.path / str(stage) / "rollouts.npz"
+            values, name = self._read(path), f"toss_{toss:02d}"
+            if stage is None or f"{name}.time_s" not in values or len(track.time_ns) == 0:
+                continue
+            with _damage(path):
+                time_ns = int(track.time_ns[0]) + np.round(1e9 * values[f"{name}.time_s"]).astype(np.int64)
+                return Rollout(time_ns, values[f"{name}.world_from_object"], self._shape(body))
+        return None
 
     def _track(self, stage: str, toss: int) -> ObjectTrack | None:
         try:

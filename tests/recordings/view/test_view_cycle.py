@@ -121,6 +121,19 @@ def test_a_contact_shape_that_was_kept_out_is_shown_beside_the_one_that_was_draw
     assert first.learned.vertices_m[0, 0] == pytest.approx(1.02 * tiny.CUBE.vertices_m[0, 0])
 
 
+def test_rollouts_on_the_last_poses_go_before_those_of_contact_learning(cycled: Path, tmp_path: Path) -> None:
+    own = tmp_path / "results"
+    shutil.copytree(cycled, own)
+    stage = write_stage(own, "rollout-99999999", {})
+    world = np.tile(np.eye(4), (5, 1, 1))
+    np.savez(stage / "rollouts.npz", **{"toss_00.world_from_object": world, "toss_00.time_s": np.arange(5.0)})  # type: ignore[arg-type]
+    record = Results.open(own).find()
+    write_variant(own, replace(record, extra={**record.extra, "rollout": stage.name}))
+    found = cycle_of(own)
+    assert len(found.rollout.time_ns) == 5
+    assert found.rollout.shape is found.steps[-1].shape
+
+
 def test_what_an_older_folder_lacks_is_left_out(cycled: Path, tmp_path: Path) -> None:
     old = tmp_path / "results"
     shutil.copytree(cycled, old)
