@@ -118,7 +118,7 @@ def solve_jointly(
     for _ in range(config.rounds):
         moved = controls.moved(shape, offsets)
         blocks = _blocks(frames, poses, moved, controls, offsets, camera, world, center, config)
-        costs.append({b.name: float(b.weight @ b.residual**2) for b in blocks})
+        costs.append(_costs(blocks))
         step, normal = _step(blocks, len(frames), len(offsets))
         information = np.stack([normal[6 * i : 6 * i + 6, 6 * i : 6 * i + 6].toarray() for i in range(len(frames))])
         turns, shifts = step[: 6 * len(frames)].reshape(-1, 2, 3)[:, 0], step[: 6 * len(frames)].reshape(-1, 2, 3)[:, 1]
@@ -128,6 +128,14 @@ def solve_jointly(
                 poses[i] = poses[i] @ about(center, turns[i], shifts[i])
         offsets = offsets + step[6 * len(frames) :]
     return Joined(poses, controls.moved(shape, offsets), information, center, tuple(costs))
+
+
+def _costs(blocks: Sequence[Block]) -> dict[str, float]:
+    """The weighted cost of every term, over all its blocks."""
+    found: dict[str, float] = {}
+    for block in blocks:
+        found[block.name] = found.get(block.name, 0.0) + float(block.weight @ block.residual**2)
+    return found
 
 
 def about(center_m: Float[Array, "3"], turn: Float[Array, "3"], shift_m: Float[Array, "3"]) -> Float[Array, "4 4"]:

@@ -13,8 +13,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 from numpy import ndarray as Array
 from scipy.linalg import solve_triangular
-from scipy.spatial import ConvexHull, cKDTree
+from scipy.spatial import cKDTree
 
+from processing.contact.support import trimmed_hull
 from processing.icp import ShapeSurface
 from processing.reproject import RaycastRenderer
 from recordings.geometry import CameraModel, rotation_log, skew
@@ -262,7 +263,7 @@ def plane_block(
     first: int, lowest: int = 4,
 ) -> Block:  # fmt: skip
     """Points below the plane after release; the lowest points at rest, which lie on it."""
-    corners = shape.vertices_m[ConvexHull(shape.vertices_m).vertices]
+    corners = trimmed_hull(shape.vertices_m, shape.faces)  # a measured mesh's spikes support nothing
     along = _hull_normals(corners)
     near, pull = controls.weights(corners)
     rows: list[tuple[int, int, float, float]] = []
