@@ -157,12 +157,21 @@ def process_with_model(run: Run, model: Path) -> VariantRecord:
 
 def _alone(run: Run, once: Mapping[int, Done], masks: Mapping[int, Done], scope: Scope) -> Pass:
     """p_i, O_i: in scope all only the first toss's shape is looked at."""
-    notes = ("each toss has its own object frame",)
+    notes = ("each toss has its own object frame", *_unfit(once))
     if run.tracker == FrameToModel.name:
         return Pass(once, once, masks, shared_frame=False, notes=notes)
     wanted = run.tosses if scope == "one" else run.tosses[:1]
     shapes = {t: field_stage(run, f"toss {t}", {t: once[t]}, {t: masks[t]}) for t in wanted}
     return Pass(once, {t: shapes.get(t, shapes[wanted[0]]) for t in run.tosses}, masks, shared_frame=False, notes=notes)
+
+
+def _unfit(once: Mapping[int, Done]) -> list[str]:
+    """Tosses in which no single rigid motion explains what is seen."""
+    return [
+        f"toss {t}: in {done.counts['unfit']} frames no pose fits: several objects, or one that is not rigid?"
+        for t, done in once.items()
+        if done.counts.get("unfit")
+    ]
 
 
 def _all_together(run: Run, once: Mapping[int, Done], masks: Mapping[int, Done]) -> Pass:
@@ -175,7 +184,11 @@ def _all_together(run: Run, once: Mapping[int, Done], masks: Mapping[int, Done])
     together = register_stage(run, dict(once), dict(masks))
     tracks = dict.fromkeys(run.tosses, together)
     left_out = together.counts["not_joined"]
-    notes = [f"tosses {left_out} could not be brought into the object frame of the others: lost"] if left_out else []
+    notes = _unfit(once)
+    notes += [f"tosses {left_out} could not be brought into the object frame of the others: lost"] if left_out else []
+    unsure = together.counts.get("ambiguous")
+    if unsure:
+        notes.append(f"tosses {unsure}: the object looks alike from several sides; their object frame may be turned")
     joined = [t for t in run.tosses if t not in left_out]
     shape = field_stage(run, "all tosses", dict.fromkeys(joined, together), {t: masks[t] for t in joined})
     return Pass(tracks, dict.fromkeys(run.tosses, shape), masks, shared_frame=True, notes=tuple(notes))
