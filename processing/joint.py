@@ -1,8 +1,8 @@
 """`joint`: one objective over shape, poses and friction, beyond the paper's alternation.
 
 E = sum of squares of residuals, each divided by its measured noise, over
+  views      the tracker's objective over depth, looks and outline of all pairs of views, in its quadratic form,
   depth      raw depth points against the surface (signed distance along the normal), robust,
-  color      the picture against the shape's own colours, after each frame's gain and offset, robust,
   flight     change of velocity against gravity, change of spin against none, for every three frames of free flight,
   rest       motion from frame to frame at rest,
   plane      what lies below the plane (hinge) anywhere after release, and the lowest points at rest on it,
@@ -17,7 +17,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int
+from jaxtyping import Float, Int
 from numpy import ndarray as Array
 from scipy import sparse
 from scipy.sparse.linalg import splu
@@ -26,15 +26,14 @@ from processing.icp import ShapeSurface
 from processing.joint_terms import (
     Block,
     Controls,
-    color_block,
     depth_block,
     flight_block,
     plane_block,
     rest_block,
     shape_block,
+    views_block,
 )
-from processing.reproject import RaycastRenderer
-from recordings.geometry import CameraModel, rotation_exp
+from recordings.geometry import rotation_exp
 from recordings.tracks import ObjectShape
 
 
@@ -43,15 +42,14 @@ class JointConfig:
     rounds: int = 4
     """Gauss-Newton steps, each with new matches, renderings and noise estimates."""
     depth_points: int = 250
-    color_points: int = 300
     controls: int = 160
     shape_sigma_m: float = 0.0006
     """How far vision's surface may be off locally."""
     shape_reach: float = 0.12
     """Reach of a control point, as a share of the shape's mean extent."""
-    points_per_measurement: float = 12.0
-    """Depth errors are alike over a patch: so many samples weigh as one independent measurement."""
-    pixels_per_measurement: float = 6.0
+    points_per_measurement: float = 100.0
+    """Depth errors are alike over patches and from frame to frame, and `views` has seen them once: so many samples
+    weigh as one independent measurement."""
     most_turn_rad: float = 0.05
     most_shift_m: float = 0.01
     """A frame that would move further in one step stays where it is in that step."""
@@ -60,16 +58,14 @@ class JointConfig:
 @dataclass(frozen=True, eq=False)
 class FrameData:
     """One tracked frame: which toss and position, its time, raw depth points (camera frame, at depth's exposure, where
-    the pose is `at_depth` after the colour's), grey image and eroded mask with the crop's corner."""
+    the pose is `at_depth` after the colour's), and the tracker's covariance (rotation vector, shift; camera axes)."""
 
     toss: int
     position: int
     time_s: float
     points_m: Float[Array, "n 3"]
     at_depth: Float[Array, "4 4"]
-    grey: Float32[Array, "h w"]
-    inside: Bool[Array, "h w"]
-    corner: tuple[int, int]
+    covariance: Float[Array, "6 6"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,19 +101,19 @@ def solve_jointly(
     frames: Sequence[FrameData],
     poses: Float[Array, "n 4 4"],
     shape: ObjectShape,
-    camera: CameraModel,
     world: World | None,
     config: JointConfig,
 ) -> Joined:
-    """Poses and shape that explain images, flight, rest and plane best together, from a start near the answer."""
+    """Poses and shape that explain views, depth, flight, rest and plane best together, from a start near the answer."""
     controls = Controls.of(shape, config.controls, config.shape_reach)
     offsets = np.zeros(len(controls.points_m))
+    begun = poses
     poses, center = poses.copy(), controls.middle_m if world is None else world.center_m
     costs: list[dict[str, float]] = []
     information = np.zeros((len(frames), 6, 6))
     for _ in range(config.rounds):
         moved = controls.moved(shape, offsets)
-        blocks = _blocks(frames, poses, moved, controls, offsets, camera, world, center, config)
+        blocks = _blocks(frames, begun, poses, moved, controls, offsets, world, center, config)
         costs.append(_costs(blocks))
         step, normal = _step(blocks, len(frames), len(offsets))
         information = np.stack([normal[6 * i : 6 * i + 6, 6 * i : 6 * i + 6].toarray() for i in range(len(frames))])
@@ -147,19 +143,17 @@ def about(center_m: Float[Array, "3"], turn: Float[Array, "3"], shift_m: Float[A
 
 
 def _blocks(
-    frames: Sequence[FrameData], poses: Float[Array, "n 4 4"], shape: ObjectShape, controls: Controls,
-    offsets: Float[Array, " k"], camera: CameraModel, world: World | None, center: Float[Array, "3"],
+    frames: Sequence[FrameData], begun: Float[Array, "n 4 4"], poses: Float[Array, "n 4 4"], shape: ObjectShape,
+    controls: Controls, offsets: Float[Array, " k"], world: World | None, center: Float[Array, "3"],
     config: JointConfig,
 ) -> list[Block]:  # fmt: skip
-    surface, renderer = ShapeSurface(shape), RaycastRenderer(shape, camera)
+    surface = ShapeSurface(shape)
     out = [shape_block(controls, offsets, config.shape_sigma_m, 6 * len(frames))]
     for i, frame in enumerate(frames):
         at = poses[i] @ frame.at_depth
         out.append(depth_block(i, frame.points_m, at, surface, controls, center, 6 * len(frames),
                                config.points_per_measurement))  # fmt: skip
-        if shape.vertex_rgb is not None:
-            out.append(color_block(i, frame.grey, frame.inside, frame.corner, poses[i], renderer, shape, camera, center,
-                                   config.color_points, config.pixels_per_measurement))  # fmt: skip
+        out.append(views_block(i, begun[i], poses[i], frame.covariance, center))
     if world is not None:
         times_s = np.array([f.time_s for f in frames])
         in_world = world.world_from_camera @ poses

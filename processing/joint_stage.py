@@ -27,7 +27,6 @@ from recordings.tracks import ObjectShape, ObjectTrack
 if TYPE_CHECKING:
     from processing.pipeline import Run
 
-MARGIN_PX = 6
 BORDER_PX = 2
 FEWEST_PX = 100
 
@@ -50,7 +49,7 @@ def joint_stage(run: Run, tracks: Mapping[int, Done], shape: Done, masks: Mappin
             return {"frames": 0, "kept_out": f"no tracked frame shows {FEWEST_PX} pixels: nothing to solve jointly"}
         poses = np.stack([before[f.toss].camera_from_object[f.position] for f in frames])
         world = outside(run, before, frames, body)
-        found = solve_jointly(frames, poses, body, run.camera, world, run.config.joint)
+        found = solve_jointly(frames, poses, body, world, run.config.joint)
         write_shape(folder, found.shape)
         for toss, track in before.items():
             mine = [i for i, f in enumerate(frames) if f.toss == toss]
@@ -58,7 +57,7 @@ def joint_stage(run: Run, tracks: Mapping[int, Done], shape: Done, masks: Mappin
         write_json(folder / "costs.json", {"rounds": list(found.costs)})
         return {"frames": len(frames), "world": world is not None}
 
-    return run.store.run("joint", 1, run.config.joint, inputs, compute)
+    return run.store.run("joint", 2, run.config.joint, inputs, compute)
 
 
 def frames_of(run: Run, track: ObjectTrack, masks: Done, config: JointConfig) -> list[FrameData]:
@@ -72,25 +71,20 @@ def frames_of(run: Run, track: ObjectTrack, masks: Done, config: JointConfig) ->
         pose = track.camera_from_object[i]
         at_depth = np.linalg.inv(pose) @ pose_at(track, i, int(streams.depth_times_ns[i]))
         time_s = 1e-9 * float(track.time_ns[i] - track.time_ns[0])
-        out.append(_frame(track.toss, i, time_s, streams[i], mask, rays, at_depth, config))
+        out.append(_frame(track.toss, i, time_s, streams[i], mask, rays, at_depth, track.covariance[i], config))
     return out
 
 
 def _frame(
     toss: int, position: int, time_s: float, frame: RgbdFrame, mask: Array, rays: Float[Array, "h w 3"],
-    at_depth: Float[Array, "4 4"], config: JointConfig,
+    at_depth: Float[Array, "4 4"], covariance: Float[Array, "6 6"], config: JointConfig,
 ) -> FrameData:  # fmt: skip
     inside = cv2.erode(mask.astype(np.uint8), np.ones((2 * BORDER_PX + 1,) * 2, np.uint8)).astype(bool)
     v, u = np.nonzero(inside & (frame.depth_m > 0))
     chosen = np.linspace(0, len(v) - 1, min(len(v), config.depth_points)).astype(int)
     v, u = v[chosen], u[chosen]
     points = rays[v, u] * frame.depth_m[v, u, None].astype(np.float64)
-    rows, columns = np.nonzero(mask)
-    top, left = max(int(rows.min()) - MARGIN_PX, 0), max(int(columns.min()) - MARGIN_PX, 0)
-    box = (slice(top, int(rows.max()) + MARGIN_PX), slice(left, int(columns.max()) + MARGIN_PX))
-    grey = cv2.cvtColor(np.ascontiguousarray(frame.color_rgb[box]), cv2.COLOR_RGB2GRAY).astype(np.float32)
-    smooth = np.asarray(cv2.GaussianBlur(grey, (0, 0), 1.0), dtype=np.float32)
-    return FrameData(toss, position, time_s, points, at_depth, smooth, inside[box], (top, left))
+    return FrameData(toss, position, time_s, points, at_depth, covariance)
 
 
 def outside(run: Run, tracks: Mapping[int, ObjectTrack], frames: list[FrameData], body: ObjectShape) -> World | None:

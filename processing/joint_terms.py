@@ -8,25 +8,25 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int
+from jaxtyping import Float, Int
 from numpy import ndarray as Array
 from scipy.linalg import solve_triangular
 from scipy.spatial import cKDTree
 
 from processing.contact.support import trimmed_hull
 from processing.icp import ShapeSurface
-from processing.reproject import RaycastRenderer
-from recordings.geometry import CameraModel, rotation_log, skew
+from recordings.geometry import rotation_log, skew
 from recordings.tracks import ObjectShape
 
 GRAVITY_M_S2 = 9.81
 TO_SIGMA = 1.4826
 """From a median absolute deviation to a standard deviation."""
-LEAST_DEPTH_M, LEAST_GREY = 0.0005, 2.0
+LEAST_DEPTH_M = 0.0005
 LEAST_M, LEAST_RAD = 1e-4, 1e-3
 LEAST_PLANE_M = 0.0005
+CONTACTS_PER_MEASUREMENT = 12.0
+"""Points that touch the plane in neighbouring frames, or while the object lies there, measure its height once."""
 REACH_M = 0.008
 """Depth further than this from the surface is something else."""
 
@@ -134,64 +134,22 @@ def depth_block(
     return _dense("depth", gap, weight, columns, np.concatenate([pose, -pull], 1))
 
 
-def color_block(
-    frame: int, grey: Float32[Array, "h w"], inside: Bool[Array, "h w"], corner: tuple[int, int],
-    camera_from_object: Float[Array, "4 4"], renderer: RaycastRenderer, shape: ObjectShape, camera: CameraModel,
-    center_m: Float[Array, "3"], most: int, pixels_per_measurement: float,
+def views_block(
+    frame: int, begun: Float[Array, "4 4"], camera_from_object: Float[Array, "4 4"], covariance: Float[Array, "6 6"],
+    center_m: Float[Array, "3"],
 ) -> Block:  # fmt: skip
-    """The picture's grey against the shape's own colours, after the frame's best gain and offset."""
-    depth_m, face, weight = renderer.hits(camera_from_object)
-    box = (slice(corner[0], corner[0] + grey.shape[0]), slice(corner[1], corner[1] + grey.shape[1]))
-    seen = inside & (depth_m[box] > 0)
-    du, dv = cv2.Sobel(grey, cv2.CV_32F, 1, 0) / 8, cv2.Sobel(grey, cv2.CV_32F, 0, 1) / 8
-    v, u = np.nonzero(seen)
-    none = np.zeros(0)
-    if len(v) < 60:
-        return _dense("color", none, none, np.zeros((0, 6)), np.zeros((0, 6)))
-    strength = np.hypot(du[v, u], dv[v, u])
-    chosen = np.argsort(-strength, kind="stable")[: 3 * most]
-    chosen = chosen[:: max(1, len(chosen) // most)]
-    v, u = v[chosen], u[chosen]
-    corners = shape.faces[face[box][v, u]]
-    share = weight[box][v, u].astype(np.float64)
-    assert shape.vertex_rgb is not None
-    drawn = (shape.vertex_rgb[corners].astype(np.float64).mean(-1) * share).sum(1)
-    place = (shape.vertices_m[corners] * share[..., None]).sum(1)
-    taken = grey[v, u].astype(np.float64)
-    residual = taken - _matched(drawn, taken)
-    gradient = np.stack([du[v, u], dv[v, u]], 1).astype(np.float64)
-    R, t = camera_from_object[:3, :3], camera_from_object[:3, 3]
-    arm = place - center_m
-    inside_camera = place @ R.T + t
-    moves = np.stack([np.cross(axis, arm) @ R.T for axis in np.eye(3)] + [np.tile(R[:, k], (len(arm), 1)) for k in
-                     range(3)], -1)  # fmt: skip
-    pixel = _pixel_slopes(camera, inside_camera)
-    slope = np.einsum("np,npc,nck->nk", gradient, pixel, moves)
-    columns = np.tile(6 * frame + np.arange(6), (len(residual), 1))
-    return _dense("color", residual, _tukey(residual, _spread(residual, LEAST_GREY)) / pixels_per_measurement,
-                  columns, slope)  # fmt: skip
-
-
-def _matched(drawn: Float[Array, " n"], taken: Float[Array, " n"]) -> Float[Array, " n"]:
-    """The drawn grey with the gain and offset that fit the picture, twice: the second time without outliers."""
-    use = np.ones(len(drawn), dtype=bool)
-    fitted = drawn
-    for _ in range(2):
-        A = np.stack([drawn, np.ones_like(drawn)], 1)
-        gain, offset = np.linalg.lstsq(A[use], taken[use], rcond=None)[0]
-        fitted = gain * drawn + offset
-        gap = np.abs(taken - fitted)
-        use = gap <= 2.5 * TO_SIGMA * np.median(gap) + 1e-9
-    return np.asarray(fitted)
-
-
-def _pixel_slopes(camera: CameraModel, points_m: Float[Array, "n 3"]) -> Float[Array, "n 2 3"]:
-    """How pixels move with points, through the lens as it is (central differences)."""
-    step = 1e-5
-    slopes = [
-        (camera.project(points_m + step * a) - camera.project(points_m - step * a)) / (2 * step) for a in np.eye(3)
-    ]
-    return np.nan_to_num(np.stack(slopes, -1))
+    """What the tracker's own objective (depth, looks and outline of every pair of views) says about a pose, in its
+    quadratic form about where it ended: the deviation from there, whitened by the covariance there."""
+    change = np.linalg.inv(begun) @ camera_from_object
+    deviation = np.concatenate([rotation_log(change[:3, :3]), change[:3, :3] @ center_m + change[:3, 3] - center_m])
+    R = begun[:3, :3]
+    to = np.zeros((6, 6))  # (rotation vector, shift of the origin; camera axes) to (turn, shift about the centre)
+    to[:3, :3], to[3:, :3], to[3:, 3:] = R.T, -R.T @ skew(R @ center_m), R.T
+    spread = to @ covariance @ to.T
+    spread += np.diag(np.r_[np.full(3, LEAST_RAD / 3), np.full(3, LEAST_M / 3)] ** 2)
+    white = solve_triangular(np.linalg.cholesky(spread), np.eye(6), lower=True)
+    columns = np.tile(6 * frame + np.arange(6), (6, 1))
+    return _dense("views", white @ deviation, np.ones(6), columns, white)
 
 
 def flight_block(
@@ -283,7 +241,7 @@ def plane_block(
     pose = np.concatenate([np.cross(corners[corner] - center_m, up), up], 1)
     grows = (up * along[corner]).sum(1)[:, None] * pull[corner]
     columns = np.concatenate([6 * frame[:, None] + np.arange(6), first + near[corner]], 1)
-    weight = _tukey(residual, _spread(residual, LEAST_PLANE_M))
+    weight = _tukey(residual, _spread(residual, LEAST_PLANE_M)) / CONTACTS_PER_MEASUREMENT
     return _dense("plane", residual, weight, columns, np.concatenate([pose, grows], 1))
 
 
