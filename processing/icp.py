@@ -42,7 +42,7 @@ class IcpConfig:
     """A direction whose eigenvalue is below this share of the best-constrained one's is not observable."""
     least_noise_m: float = 0.0008
     """Depth is never trusted more than this, however well the shape fits."""
-    points_per_measurement: float = 100.0
+    points_per_measurement: float = 300.0
     """Depth errors are alike over a patch of pixels: so many points weigh as one independent measurement."""
 
 
