@@ -22,8 +22,9 @@ $(STAMP): pyproject.toml constraints.txt
 demo: $(STAMP)
 	$(BIN)/toss-session info $(SAMPLE)
 	$(BIN)/toss-process $(SAMPLE) --out $(OUT)/results
+	$(BIN)/toss-view $(OUT)/results --save $(OUT)/result.rrd
 	$(BIN)/toss-view $(OUT)/results --screenshot $(OUT)/result.png
-	@echo "look at $(OUT)/result.png, read $(OUT)/results/table.md, open it: $(BIN)/toss-view $(OUT)/results"
+	@echo "look at $(OUT)/result.png and $(OUT)/results/report.html, open $(OUT)/result.rrd: $(BIN)/toss-view $(OUT)/results"
 
 test: $(STAMP)
 	$(BIN)/python -m pytest -q -m "not slow and not gpu and not rig"
