@@ -20,6 +20,7 @@ from processing.cycle import Pass, alone_start, run_cycle
 from processing.dynamics import rollout_stage
 from processing.frames import corrected_frames
 from processing.masks import object_masks, static_scene
+from processing.one_shape import of_one_shape
 from processing.segment.static_scene import StaticScene
 from processing.stage import Counts, Done, Store, locked, plain
 from processing.start_pose import StartPose
@@ -137,6 +138,7 @@ def process(run: Run, variant: Variant, scope: Scope) -> VariantRecord:
     else:
         first = _all_together(run, once, masks)  # P, O
         last = first if variant.refined is None else _refined_rows(run, variant, scope, once, first, masks)
+        last = _with_apart(run, last, once, masks)
     record = _record(run, variant, scope, last, masks)
     with locked(run.store.results / ".variants.lock"):
         write_variant(run.store.results, record)
@@ -191,7 +193,24 @@ def _all_together(run: Run, once: Mapping[int, Done], masks: Mapping[int, Done])
         notes.append(f"tosses {unsure}: the object looks alike from several sides; their object frame may be turned")
     joined = [t for t in run.tosses if t not in left_out]
     shape = field_stage(run, "all tosses", dict.fromkeys(joined, together), {t: masks[t] for t in joined})
-    return Pass(tracks, dict.fromkeys(run.tosses, shape), masks, shared_frame=True, notes=tuple(notes))
+    kept, apart = of_one_shape(run, together, shape, masks, joined)
+    if apart:
+        notes.append(f"tosses {apart}: their place among the others is wrong, no one shape explains both: kept apart")
+        shape = field_stage(run, "all tosses", dict.fromkeys(kept, together), {t: masks[t] for t in kept})
+    there = [t for t in run.tosses if t not in apart]
+    return Pass({t: tracks[t] for t in there}, dict.fromkeys(there, shape), {t: masks[t] for t in there},
+                shared_frame=not apart, notes=tuple(notes))  # fmt: skip
+
+
+def _with_apart(run: Run, last: Pass, once: Mapping[int, Done], masks: Mapping[int, Done]) -> Pass:
+    """Tosses that were kept apart, as the first pass on each alone left them: in their own object frame."""
+    apart = [t for t in run.tosses if t not in last.tracks]
+    shapes = {t: field_stage(run, f"toss {t}", {t: once[t]}, {t: masks[t]}) for t in apart}
+    tracks = {t: once[t] for t in apart}
+    if not apart:
+        return last
+    return replace(last, tracks={**last.tracks, **tracks}, shapes={**last.shapes, **shapes},
+                   masks={**last.masks, **{t: masks[t] for t in apart}}, shared_frame=False)  # fmt: skip
 
 
 def _refined_rows(
@@ -202,7 +221,7 @@ def _refined_rows(
         ended = run_cycle(run, variant, first, "all tosses")
         return _with_rollouts(run, ended) if variant.icp and ended.contact else ended
     parts = []
-    for toss in run.tosses:
+    for toss in first.tracks:
         alone = alone_start(run, toss, first, once[toss], masks[toss])
         parts.append(run_cycle(run, variant, alone, f"toss {toss}"))
     return Pass.joined(parts)

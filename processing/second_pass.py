@@ -42,6 +42,8 @@ class CycleConfig:
     start: Start = "shape"
     """`anew` (the paper): the second pass is given the first pose only. `poses`: the poses at which the shape was drawn
     are refined, only lost frames are sought. `shape`: the same, and the shape's own surface and colours take part."""
+    apart_mask: float = 0.12
+    """A toss whose outline the common shape misses by more (1 - IoU, median over frames) is not of that shape."""
     worse_share: float = 0.005
     most_passes: int = 4
     same_rotation_deg: float = 0.05

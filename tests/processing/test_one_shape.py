@@ -1,0 +1,53 @@
+"""Tosses that are turned against each other show no one shape, and are told from those that do."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from processing.config import Config
+from processing.one_shape import _fused_stage, of_one_shape
+from processing.pipeline import Run, start_run
+from processing.stage import Done
+from recordings.geometry import rotation_exp
+from recordings.progress import Silent
+from recordings.results import write_masks, write_track
+from recordings.session import Session
+from recordings.tracks import ObjectTrack
+
+
+def stages(tiny_world: Any, run: Run, folder: Path, turned: int | None) -> tuple[Done, dict[int, Done]]:
+    """True poses as the stage of all tosses, one of them turned about the object's middle, and true masks."""
+    tracks, masks = folder / "register-0", {}
+    tracks.mkdir()
+    for toss in run.tosses:
+        times_ns = run.frames(toss).times_ns
+        poses = [(tiny_world.world_from_camera.inverse() @ p).matrix for p in tiny_world.poses(len(times_ns), toss)]
+        turn = np.eye(4)
+        if toss == turned:
+            turn[:3, :3] = rotation_exp(np.array([0.0, np.pi / 2, 0.0]))
+        n = len(times_ns)
+        status: Any = ("tracked",) * n
+        track = ObjectTrack(
+            toss, "d455", "object", times_ns, np.stack(poses) @ turn, status, np.tile(1e-6 * np.eye(6), (n, 1, 1))
+        )
+        write_track(tracks, track)
+        own = folder / f"segment-{toss}"
+        own.mkdir()
+        write_masks(own, toss, [tiny_world.see(p, i)[1] for i, p in enumerate(tiny_world.poses(n, toss))], np.ones(n))
+        masks[toss] = Done(own, f"masks {toss} {turned}", {}, False)
+    return Done(tracks, f"tracks {turned}", {}, False), masks
+
+
+@pytest.mark.parametrize(("turned", "kept", "apart"), [(None, [0, 1, 2], []), (1, [0, 2], [1])])
+def test_a_toss_that_is_turned_against_the_others_is_kept_apart(
+    tiny_world: Any, tmp_path: Path, turned: int | None, kept: list[int], apart: list[int]
+) -> None:
+    session = Session.open(tiny_world.record(tmp_path / "tiny", tosses=(0, 1, 2), frames=6))
+    run = start_run(session, session.tosses, tmp_path / "out", Config(), "multi-hypothesis", lambda _: Silent())
+    together, masks = stages(tiny_world, run, tmp_path, turned)
+    fused = _fused_stage(run, together, masks)
+    assert of_one_shape(run, together, fused, masks, list(session.tosses)) == (kept, apart)
