@@ -184,14 +184,17 @@ def test_hidden_frames_are_interpolated_or_lost_but_never_silent(tiny_world: Any
     assert track.covariance[4, 0, 0] > track.covariance[3, 0, 0]
 
 
-def test_depth_exposed_late_is_moved_to_the_color(tiny_world: Any, toss: Any) -> None:
-    late = []
-    count = 7
-    for i, frame in enumerate(toss[0][:count]):
-        nearer = min(i + 1, COUNT - 1)
-        late.append(replace(frame, depth_m=toss[0][nearer].depth_m, depth_time_ns=toss[0][nearer].time_ns))
-    estimate = followed(tiny_world, (late, toss[1][:count])).track.camera_from_object
-    errors = frame_errors(estimate @ align_first(estimate, toss[2][:count]), toss[2][:count], np.eye(3) * 0.05)
+def test_depth_exposed_half_a_frame_late_is_moved_to_the_color(tiny_world: Any) -> None:
+    every_half = tiny_world.poses(16)
+    frames, masks, truth = [], [], []
+    for i in range(8):
+        now, mask = tiny_world.see(every_half[2 * i], i)
+        later, _ = tiny_world.see(every_half[2 * i + 1], i)
+        frames.append(replace(now, depth_m=later.depth_m, depth_time_ns=now.time_ns + 16_666_667))
+        masks.append(mask)
+        truth.append((tiny_world.world_from_camera.inverse() @ every_half[2 * i]).matrix)
+    estimate = followed(tiny_world, (frames, masks)).track.camera_from_object
+    errors = frame_errors(estimate @ align_first(estimate, np.stack(truth)), np.stack(truth), np.eye(3) * 0.05)
     assert np.median(errors.translation_m) < 0.008
 
 
