@@ -18,6 +18,8 @@ from numpy import ndarray as Array
 from recordings.geometry import CameraModel, rotation_exp, skew
 from recordings.tracks import ObjectShape
 
+LEAST_SIGMA = (0.002, 0.0003)
+"""Radians and metres that a pose is uncertain by at least."""
 Verdict = Literal["aligned", "too few points", "poor fit", "moved too far", "lost"]
 
 
@@ -199,14 +201,19 @@ def _solve(
 def _known(
     surface: ShapeSurface, camera_from_object: Float[Array, "4 4"], covariance: Float[Array, "6 6"] | None
 ) -> Float[Array, "6 6"]:
-    """A track's covariance as information on a correction about the shape's centre in object axes."""
+    """A track's covariance as information on a correction about the shape's centre in object axes.
+
+    No pose is surer than LEAST_SIGMA, least of all one that was held fixed so that the others had a frame (covariance
+    zero).
+    """
     if covariance is None or not np.isfinite(covariance).all():
         return np.zeros((6, 6))
     turn = camera_from_object[:3, :3]
     to = np.zeros((6, 6))
     to[:3, :3] = surface.radius_m * turn.T
     to[3:, :3], to[3:, 3:] = -turn.T @ skew(turn @ surface.centre_m), turn.T
-    return np.asarray(np.linalg.pinv(to @ covariance @ to.T, hermitian=True))
+    least = np.diag(np.repeat(LEAST_SIGMA, 3) ** 2)
+    return np.asarray(np.linalg.inv(to @ (covariance + least) @ to.T))
 
 
 def _about(centre_m: Float[Array, "3"], move: Float[Array, "6"]) -> Float[Array, "4 4"]:

@@ -141,6 +141,8 @@ def test_what_the_track_knows_well_and_depth_badly_stays_with_the_track() -> Non
     free = align_frame(surface, points, pose, IcpConfig(least_fitness=0.3)).camera_from_object
     tight = np.diag([1e-4, 1e-4, 1e-4, 1e-4, 1e-4, 1e-4]) ** 2
     held = align_frame(surface, points, pose, IcpConfig(least_fitness=0.3), tight).camera_from_object
+    fixed = align_frame(surface, points, pose, IcpConfig(least_fitness=0.3), np.zeros((6, 6))).camera_from_object
+    assert abs(fixed[2, 3] - 0.6) < 0.5 * abs(free[2, 3] - 0.6)  # held so that others had a frame: not unknown
     assert free[2, 3] == pytest.approx(0.604, abs=5e-4)
     assert abs(held[2, 3] - 0.6) < 0.5 * abs(free[2, 3] - 0.6)
     assert np.abs(held[:2, 3]).max() < 1e-3
