@@ -79,7 +79,7 @@ def align_stage(
             write_masks(folder, toss, second.masks, read_masks(masks[toss].folder, toss).confidence)
         return {"icp": total}
 
-    return run.store.run("reproject", 1, config, inputs, compute)
+    return run.store.run("reproject", 2, config, inputs, compute)
 
 
 def _laid_on_depth(
