@@ -71,6 +71,10 @@ def run_cycle(run: Run, variant: Variant, start: Pass, name: str) -> Pass:
         return refined
     ended = second_pass(run, refined, start.masks, name, variant.icp)
     told = _told(run, start, ended, start.masks, name)
+    if told["worse_share"] > run.config.cycle.much_worse:
+        worse = f"explains the raw images worse by {100 * told['worse_share']:.1f} %"
+        note = f"{name}: the second pass {worse}: kept out, poses and shape are those before it"
+        return replace(refined, passes=(told,), notes=(*refined.notes, note))
     return replace(ended, passes=(told,), notes=(*ended.notes, *_said(told), *departures(run.config.cycle)))
 
 

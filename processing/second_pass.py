@@ -44,6 +44,8 @@ class CycleConfig:
     are refined, only lost frames are sought. `shape`: the same, and the shape's own surface and colours take part."""
     apart_mask: float = 0.12
     """A toss whose outline the common shape misses by more (1 - IoU, median over frames) is not of that shape."""
+    much_worse: float = 0.02
+    """A second pass whose residuals on the raw images are larger by more than this is kept out, and said to be."""
     worse_share: float = 0.005
     most_passes: int = 4
     same_rotation_deg: float = 0.05
