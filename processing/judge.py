@@ -19,6 +19,8 @@ from recordings.geometry import CameraModel
 from recordings.records import RgbdFrame
 from recordings.tracks import ObjectShape, ObjectTrack
 
+HIDDEN_M = 0.015
+"""What the camera measured this much nearer than the shape stands in front of it."""
 FAR_M = 0.02
 """Residuals beyond this are one and the same: not explained."""
 SLACK_M = 5e-5
@@ -134,7 +136,8 @@ def explain(
         frame = frames[i]
         depth_m, rgb = drawer.draw(pose)
         seen = depth_m > 0
-        union = float((seen | mask).sum())
+        hidden = seen & ~mask & (frame.depth_m > 0) & (frame.depth_m < depth_m - HIDDEN_M)  # a hand stands before it
+        union = float(((seen & ~hidden) | mask).sum())
         inside = cv2.erode(mask.astype(np.uint8), kernel).astype(bool)
         measured = inside & (frame.depth_m > 0)
         gap = np.where(seen, np.abs(frame.depth_m - depth_m), FAR_M)[measured]
