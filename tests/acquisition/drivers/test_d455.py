@@ -35,7 +35,7 @@ def played(camera: D455Camera) -> list[RgbdCapture]:
 
 
 def test_colour_and_raw_depth_come_apart_each_with_its_own_stamp(db3: Callable[..., Path]) -> None:
-    with D455Camera(file=db3("plain")) as camera:
+    with D455Camera(file=db3("plain"), playback="fast") as camera:
         captures = played(camera)
         place, models = camera.color_from_depth(), camera.cameras()
     assert len(captures) >= 18  # the SDK's pairing may swallow the first
