@@ -1,4 +1,4 @@
-"""Is a shape better or worse, without truth? By the contact loss at given poses, and by its distance to raw depth."""
+"""Is a shape better or worse, without truth? By the contact loss at given poses (raw depth: processing/judge.py)."""
 
 from __future__ import annotations
 
@@ -113,43 +113,6 @@ def series_of(
         time_s = 1e-9 * (track.time_ns[kept] - track.time_ns[0]) if len(track.time_ns) else np.zeros(0)
         out.append(PoseSeries(toss, time_s, moved[:, :3, :3].copy(), moved[:, :3, 3].copy()))
     return out
-
-
-@dataclass(frozen=True)
-class SurfaceResidual:
-    """How far measured points lie from a surface, in metres; `inliers` is the share within the limit."""
-
-    mean_m: float
-    median_m: float
-    p90_m: float
-    inliers: float
-    points: int
-
-    def worse_than(self, other: SurfaceResidual, slack_m: float = 5e-5) -> bool:
-        """Whether a shape with this residual explains the same points worse than one with the other."""
-        return self.mean_m > other.mean_m + slack_m
-
-
-def surface_residual(
-    shape: ObjectShape, points_object_m: Float[Array, "n 3"], limit_m: float = 0.01
-) -> SurfaceResidual:
-    """Distances of raw depth points (moved to the object frame by the poses) to a mesh. Those beyond the limit count
-    as the limit: a flying pixel weighs no more."""
-    import open3d as o3d
-
-    scene = o3d.t.geometry.RaycastingScene()
-    scene.add_triangles(
-        o3d.core.Tensor(shape.vertices_m.astype(np.float32)), o3d.core.Tensor(shape.faces.astype(np.uint32))
-    )
-    gap = scene.compute_distance(o3d.core.Tensor(points_object_m.astype(np.float32))).numpy().astype(np.float64)
-    cut = np.minimum(gap, limit_m)
-    return SurfaceResidual(
-        float(cut.mean()),
-        float(np.median(cut)),
-        float(np.quantile(cut, 0.9)),
-        float((gap <= limit_m).mean()),
-        len(gap),
-    )
 
 
 def uniform_model(shape: ObjectShape, physics: Physics, friction: float, plane: Plane) -> ContactModel:
