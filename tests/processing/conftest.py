@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
+from processing.segment.static_scene import SceneSettings, StaticScene, calibrated_table_depth, learn_scene
 from recordings.geometry import CameraModel, Transform, rotation_exp
 from recordings.records import DepthImage, EncodedImage, RgbdFrame, StampedPose
 from recordings.session_writer import SessionWriter, write_truth
@@ -148,3 +149,16 @@ def record_tiny(tiny_world: TinyWorld, tmp_path: Path) -> Callable[..., Path]:
         return tiny_world.record(tmp_path / name, **options)  # type: ignore[arg-type]
 
     return record
+
+
+@pytest.fixture(scope="module")
+def toss(tiny_world: TinyWorld) -> tuple[list[RgbdFrame], list[np.ndarray]]:
+    """Twelve frames of the box and its true masks."""
+    seen = [tiny_world.see(pose, i) for i, pose in enumerate(tiny_world.poses(12))]
+    return [f for f, _ in seen], [m for _, m in seen]
+
+
+@pytest.fixture(scope="module")
+def scene(tiny_world: TinyWorld, toss: tuple[list[RgbdFrame], list[np.ndarray]]) -> StaticScene:
+    """What stands behind those frames."""
+    return learn_scene(toss[0], calibrated_table_depth(tiny_world.calibration, "d455"), SceneSettings())

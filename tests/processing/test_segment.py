@@ -33,17 +33,6 @@ def iou(a: np.ndarray, b: np.ndarray) -> float:
     return float((a & b).sum() / max(1, (a | b).sum()))
 
 
-@pytest.fixture(scope="module")
-def toss(tiny_world: Any) -> tuple[list[RgbdFrame], list[np.ndarray]]:
-    seen = [tiny_world.see(pose, i) for i, pose in enumerate(tiny_world.poses(COUNT))]
-    return [f for f, _ in seen], [m for _, m in seen]
-
-
-@pytest.fixture(scope="module")
-def scene(tiny_world: Any, toss: tuple[list[RgbdFrame], list[np.ndarray]]) -> StaticScene:
-    return learn_scene(toss[0], calibrated_table_depth(tiny_world.calibration, "d455"), SceneSettings())
-
-
 def segment(
     world: Any, scene: StaticScene, frames: Sequence[RgbdFrame], given: dict[int, np.ndarray], **more: Any
 ) -> list[Any]:
