@@ -183,8 +183,19 @@ def inside_hull(shape: tuple[int, ...], cells: Int[Array, "n 3"]) -> Bool[Array,
     except QhullError:
         return np.zeros(shape, dtype=bool)
     planes = np.unique(np.round(hull.equations, 6), axis=0)
-    inside = np.ones(shape, dtype=bool)
-    axes = np.ogrid[tuple(slice(0, n) for n in shape)]
+    rows, columns = np.ogrid[: shape[0], : shape[1]]
+    lowest, highest = np.zeros(shape[:2]), np.full(shape[:2], shape[2] - 1.0)  # along the last axis
     for a, b, c, offset in planes:
-        inside &= (a * axes[0] + b * axes[1] + c * axes[2] + offset) <= 0
-    return inside
+        rest = a * rows + b * columns + offset
+        if c > 0:
+            highest = np.minimum(highest, -rest / c)
+        elif c < 0:
+            lowest = np.maximum(lowest, -rest / c)
+        else:
+            highest = np.where(rest > 0, -1, highest)
+    layers = np.arange(shape[2])
+    return (layers >= lowest[..., None] - ON_HULL) & (layers <= highest[..., None] + ON_HULL)
+
+
+ON_HULL = 1e-6
+"""Cells: rounding of a cell that lies on the hull itself."""

@@ -26,8 +26,9 @@ class ObjectField(nn.Module):
         self.register_buffer("low", torch.tensor(grid.origin_m, dtype=torch.float32))
         self.register_buffer("size", torch.tensor((shape - 1) * grid.voxel_m, dtype=torch.float32))
         self.truncation_m = grid.truncation_m
-        warm = np.concatenate([grid.sdf_m[None].clip(-0.03, 0.03), np.moveaxis(grid.rgb, -1, 0)])
-        self.warm = nn.Parameter(torch.tensor(warm)[None])
+        distance_m = torch.tensor(grid.sdf_m.clip(-0.03, 0.03))
+        self.warm_distance = nn.Parameter(distance_m[None, None])
+        self.warm_color = nn.Parameter(torch.tensor(np.ascontiguousarray(np.moveaxis(grid.rgb, -1, 0)))[None])
         self.encoding = make_encoding(encoding)
         n = self.encoding.features
         self.geometry = nn.Sequential(nn.Linear(n, hidden), nn.Softplus(beta=100), nn.Linear(hidden, 1))
@@ -41,14 +42,30 @@ class ObjectField(nn.Module):
 
     def forward(self, points_m: Tensor) -> tuple[Tensor, Tensor]:
         """Signed distance (n,) in metres and colour (n, 3)."""
-        unit = (points_m - self.low) / self.size
-        features = self.encoding(unit)
-        warm = sample_grid(self.warm, unit)
-        sdf_m = warm[:, 0] + self.truncation_m * self.geometry(features)[:, 0]
-        return sdf_m, warm[:, 1:] + self.appearance(features)
+        return self.sdf(points_m), self.color(points_m)
 
     def sdf(self, points_m: Tensor) -> Tensor:
         """Signed distance (n,) in metres."""
-        unit = (points_m - self.low) / self.size
-        residual = self.geometry(self.encoding(unit))[:, 0]
-        return sample_grid(self.warm[:, :1], unit)[:, 0] + self.truncation_m * residual
+        unit = self._unit(points_m)
+        return self._distance(unit, self.encoding(unit))
+
+    def color(self, points_m: Tensor) -> Tensor:
+        """Colour (n, 3)."""
+        unit = self._unit(points_m)
+        return self._color(unit, self.encoding(unit))
+
+    def sdf_and_color(self, points_m: Tensor, colored_m: Tensor) -> tuple[Tensor, Tensor]:
+        """Signed distance of some points and colour of others. One pass: the gradient of a grid is a grid, so that
+        every further pass costs one more of its size."""
+        unit = self._unit(torch.cat([points_m, colored_m]))
+        features, n = self.encoding(unit), len(points_m)
+        return self._distance(unit[:n], features[:n]), self._color(unit[n:], features[n:])
+
+    def _unit(self, points_m: Tensor) -> Tensor:
+        return (points_m - self.low) / self.size
+
+    def _distance(self, unit: Tensor, features: Tensor) -> Tensor:
+        return sample_grid(self.warm_distance, unit)[:, 0] + self.truncation_m * self.geometry(features)[:, 0]
+
+    def _color(self, unit: Tensor, features: Tensor) -> Tensor:
+        return sample_grid(self.warm_color, unit) + self.appearance(features)

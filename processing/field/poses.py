@@ -86,7 +86,7 @@ def _normal_equations(
     facing = (sdf_gradient * along).sum(-1)
     facing = torch.where(facing < -0.2, facing, torch.full_like(facing, -0.2))
     on_surface = points - (sdf / facing).clamp(-0.004, 0.004)[:, None] * along
-    luma, luma_gradient = _with_gradient(lambda x: model(x)[1] @ torch.tensor(LUMA, device=x.device), on_surface)
+    luma, luma_gradient = _with_gradient(lambda x: model.color(x) @ torch.tensor(LUMA, device=x.device), on_surface)
     luma_gradient = luma_gradient - sdf_gradient * ((luma_gradient * along).sum(-1) / facing)[:, None]
     seen = pool.rgb[rays] @ torch.tensor(LUMA, device=points.device)
     depth_sigma = config.depth_sigma_m * (pool.depth[rays] / 0.8) ** 2

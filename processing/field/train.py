@@ -105,7 +105,7 @@ def refined_views(
 def _optimise(
     model: ObjectField, poses: Poses, pool: RayPool, config: FieldConfig, progress: Progress
 ) -> tuple[float, ...]:
-    optimiser = torch.optim.Adam(_groups(model, config), betas=(0.9, 0.99))
+    optimiser = torch.optim.Adam(_groups(model, config), betas=(0.9, 0.99), fused=True)
     schedule = torch.optim.lr_scheduler.ExponentialLR(optimiser, 0.1 ** (1 / max(config.steps, 1)))
     losses = []
     for step in range(config.steps):
@@ -136,85 +136,118 @@ def to_object(poses: Poses, in_camera: Tensor, view: Tensor) -> Tensor:
     return ((in_camera - translation[view])[:, None, :] @ rotation[view])[:, 0]
 
 
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """Points (n, 3) of the object frame where a loss term wants the distance, with what it wants there."""
+
+    points_m: Tensor
+    target_m: Tensor
+    weight: Tensor
+
+
 def total_loss(model: ObjectField, poses: Poses, pool: RayPool, config: FieldConfig) -> Tensor:
     """The weighted sum over one random batch; each term is mean-square or mean-absolute in units of the truncation."""
-    chosen = torch.randint(len(pool.depth), (config.rays,), device=pool.depth.device)
-    passing = torch.randint(max(len(pool.passing_view), 1), (config.rays // 4,), device=pool.depth.device)
-    surface, points = near_surface_loss(model, poses, pool, chosen, config)
-    free = free_space_loss(model, poses, pool, chosen[: config.rays // 4])
-    loss = surface + config.free_weight * free
-    loss = loss + config.color_weight * color_loss(model, poses, pool, chosen)
-    if len(pool.passing_view):
-        loss = loss + config.passing_weight * passing_loss(model, poses, pool, passing)
-    return loss + config.eikonal_weight * eikonal_loss(model, points[: config.rays // 2].detach())
+    device = pool.depth.device
+    chosen = torch.randint(len(pool.depth), (config.rays,), device=device)
+    passing = torch.randint(max(len(pool.passing_view), 1), (config.rays // 4,), device=device)
+    near = near_surface_samples(model, poses, pool, chosen, config.near_samples)
+    free = free_space_samples(model, poses, pool, chosen[: config.rays // 4])
+    beside_m = passing_points(model, poses, pool, passing) if len(pool.passing_view) else near.points_m[:0]
+    around_m = eikonal_points(near.points_m[: config.rays // 2].detach())
+    surface_m = to_object(poses, pool.direction[chosen] * pool.depth[chosen][:, None], pool.view[chosen])
+    parts = [near.points_m, free.points_m, beside_m, around_m]
+    distances, rgb = model.sdf_and_color(torch.cat(parts), surface_m)
+    at_near, at_free, at_beside, at_around = distances.split([len(p) for p in parts])
+    loss = near_surface_loss(at_near, near, model.truncation_m)
+    loss = loss + config.free_weight * free_space_loss(at_free, free, model.truncation_m)
+    loss = loss + config.color_weight * ((rgb - pool.rgb[chosen]).abs() * pool.colored[chosen, None]).mean()
+    if len(beside_m):
+        inside = inside_only(model, beside_m, at_beside)
+        loss = loss + config.passing_weight * passing_loss(inside, model.truncation_m)
+    return loss + config.eikonal_weight * eikonal_loss(at_around)
 
 
-def near_surface_loss(
-    model: ObjectField, poses: Poses, pool: RayPool, chosen: Tensor, config: FieldConfig
-) -> tuple[Tensor, Tensor]:
-    """Huber loss of sdf(x) against x's distance to the pixel's plane, (1 - n . x) / |n|, in units of the truncation."""
-    k = config.near_samples
-    rays = chosen.repeat_interleave(k)
+def near_surface_samples(model: ObjectField, poses: Poses, pool: RayPool, chosen: Tensor, each: int) -> Samples:
+    """Points within the truncation of the measured surface and their distance to the pixel's plane,
+    (1 - n . x) / |n|."""
+    rays = chosen.repeat_interleave(each)
     direction, depth, plane = pool.direction[rays], pool.depth[rays], pool.plane[rays]
     along = (torch.rand(len(rays), device=depth.device) * 2 - 1) * model.truncation_m
     in_camera = direction * (depth + along / direction.norm(dim=-1))[:, None]
     target = (1 - (plane * in_camera).sum(-1)) / plane.norm(dim=-1)
-    points = to_object(poses, in_camera, pool.view[rays])
-    sdf = model.sdf(points)
     behind = torch.where(target < 0, 1 + target / model.truncation_m, torch.ones_like(target)).clamp(0.05)
     sharp = (pool.depth.median() / depth) ** 4
-    gap = (sdf - target) / model.truncation_m
-    weight = behind * sharp.clamp(max=4)
+    return Samples(to_object(poses, in_camera, pool.view[rays]), target, behind * sharp.clamp(max=4))
+
+
+def near_surface_loss(distance_m: Tensor, wanted: Samples, truncation_m: float) -> Tensor:
+    """Weighted mean of the Huber loss of sdf(x) against x's distance to the pixel's plane."""
+    gap = (distance_m - wanted.target_m) / truncation_m
     huber = torch.nn.functional.huber_loss(gap, torch.zeros_like(gap), reduction="none", delta=0.3)
-    return (weight * huber).mean(), points
+    return (wanted.weight * huber).mean()
 
 
-def free_space_loss(model: ObjectField, poses: Poses, pool: RayPool, chosen: Tensor) -> Tensor:
-    """Before the surface the distance is at least the truncation: mean square of what is missing."""
+def free_space_samples(model: ObjectField, poses: Poses, pool: RayPool, chosen: Tensor) -> Samples:
+    """Points well before the surface and the least distance there."""
     direction, depth = pool.direction[chosen], pool.depth[chosen]
     before = model.truncation_m * (1.5 + 4 * torch.rand(len(chosen), device=depth.device))
     in_camera = direction * (depth - before / direction.norm(dim=-1))[:, None]
     plane = pool.plane[chosen]
     distance = (1 - (plane * in_camera).sum(-1)) / plane.norm(dim=-1)
-    sdf = model.sdf(to_object(poses, in_camera, pool.view[chosen]))
     wanted = distance.clamp(0, model.truncation_m)
-    return ((wanted - sdf).clamp(min=0) / model.truncation_m).square().mean()
+    return Samples(to_object(poses, in_camera, pool.view[chosen]), wanted, torch.ones_like(wanted))
 
 
-def passing_loss(model: ObjectField, poses: Poses, pool: RayPool, chosen: Tensor) -> Tensor:
-    """A ray beside the mask never enters the object: mean square of the depth of the worst of eight samples on it."""
+def free_space_loss(distance_m: Tensor, wanted: Samples, truncation_m: float) -> Tensor:
+    """Mean square of what is missing to the least distance."""
+    return ((wanted.target_m - distance_m).clamp(min=0) / truncation_m).square().mean()
+
+
+PASSING_SAMPLES = 8
+"""Points looked at on a ray that passes the object."""
+
+
+def passing_points(model: ObjectField, poses: Poses, pool: RayPool, chosen: Tensor) -> Tensor:
+    """Points on rays beside the mask, where they cross the box of the object."""
     view = pool.passing_view[chosen]
     centre = poses[1][view] + (poses[0][view] @ (model.low + model.size / 2)[:, None])[..., 0]
-    reach = model.size.norm() / 2
-    k = 8
+    reach, k = model.size.norm() / 2, PASSING_SAMPLES
     steps = (torch.arange(k, device=view.device) + torch.rand(len(chosen), 1, device=view.device)) / k * 2 - 1
-    depths = centre[:, 2:3] + reach * steps
-    in_camera = pool.passing_direction[chosen][:, None, :] * depths[..., None]
-    points = to_object(poses, in_camera.reshape(-1, 3), view.repeat_interleave(k))
-    unit = (points - model.low) / model.size
+    in_camera = pool.passing_direction[chosen][:, None, :] * (centre[:, 2:3] + reach * steps)[..., None]
+    return to_object(poses, in_camera.reshape(-1, 3), view.repeat_interleave(k))
+
+
+def inside_only(model: ObjectField, points_m: Tensor, distance_m: Tensor) -> Tensor:
+    """How deep inside the object points are (n,), metres; 0 outside it and outside the grid."""
+    unit = (points_m - model.low) / model.size
     within = ((unit > 0) & (unit < 1)).all(-1)
-    inside = torch.where(within, (-model.sdf(points)).clamp(min=0), torch.zeros(()).to(points))
-    return (inside.reshape(-1, k).amax(1) / model.truncation_m).square().mean()
+    return torch.where(within, (-distance_m).clamp(min=0), torch.zeros(()).to(points_m))
 
 
-def color_loss(model: ObjectField, poses: Poses, pool: RayPool, chosen: Tensor) -> Tensor:
-    """Mean absolute difference of the colour at the measured surface point."""
-    in_camera = pool.direction[chosen] * pool.depth[chosen][:, None]
-    _, rgb = model(to_object(poses, in_camera, pool.view[chosen]))
-    return ((rgb - pool.rgb[chosen]).abs() * pool.colored[chosen, None]).mean()
+def passing_loss(inside_m: Tensor, truncation_m: float) -> Tensor:
+    """A ray beside the mask never enters the object: mean square of the depth of its worst sample."""
+    return (inside_m.reshape(-1, PASSING_SAMPLES).amax(1) / truncation_m).square().mean()
 
 
-def eikonal_loss(model: ObjectField, points: Tensor) -> Tensor:
-    """Mean square of |gradient| - 1, by central differences of two millimetres."""
-    h = 0.002
-    shifts = torch.eye(3, device=points.device) * h
-    gradient = torch.stack([(model.sdf(points + s) - model.sdf(points - s)) / (2 * h) for s in shifts], -1)
-    return (gradient.norm(dim=-1) - 1).square().mean()
+EIKONAL_M = 0.002
+"""Half the base of the central differences."""
+
+
+def eikonal_points(points_m: Tensor) -> Tensor:
+    """Six neighbours (6 n, 3) of each point, two along each axis."""
+    shifts = torch.eye(3, device=points_m.device) * EIKONAL_M
+    return torch.cat([points_m + s for s in (*shifts, *-shifts)])
+
+
+def eikonal_loss(distance_m: Tensor) -> Tensor:
+    """Mean square of |gradient| - 1 from the distances at `eikonal_points`."""
+    ahead, behind = distance_m.reshape(2, 3, -1)
+    return ((ahead - behind).norm(dim=0) / (2 * EIKONAL_M) - 1).square().mean()
 
 
 def _groups(model: ObjectField, config: FieldConfig) -> list[dict[str, object]]:
     networks = [*model.encoding.parameters(), *model.geometry.parameters(), *model.appearance.parameters()]
     return [
         {"params": networks, "lr": config.learning_rate},
-        {"params": [model.warm], "lr": config.warm_learning_rate},
+        {"params": [model.warm_distance, model.warm_color], "lr": config.warm_learning_rate},
     ]
