@@ -207,7 +207,7 @@ def second_field(
         write_shape(folder, learned)
         return {"views": used, "vertices": len(learned.vertices_m)}
 
-    return run.store.run("field", 1, run.config.shape, inputs, compute)
+    return run.store.run("field", 2, run.config.shape, inputs, compute)
 
 
 def input_keys(tracks: Mapping[int, Done], masks: Mapping[int, Done]) -> dict[str, str]:
