@@ -15,7 +15,7 @@ from jaxtyping import Float
 from numpy import ndarray as Array
 from scipy.spatial.transform import Rotation
 
-from processing.dynamics import contact_stage
+from processing.dynamics import contact_stage, held_out_loss_j, held_out_model
 from processing.icp import ShapeSurface
 from processing.joint_stage import joint_stage
 from processing.judge import Explained, difference, explain, pooled
@@ -153,11 +153,22 @@ def _joint(run: Run, start: Pass, name: str) -> Pass:
     return replace(ended, passes=(_told(run, begun, ended, start.masks, name),))
 
 
+EVIDENCE = ("depth_m", "mask", "color", "contact_j")
+"""What passes are compared by, each weighing the same: residuals on the raw images (judge.py), and the contact loss of
+tosses from which nothing of contact was learned."""
+
+
 def _told(run: Run, before: Pass, after: Pass, masks: Mapping[int, Done], name: str) -> dict[str, Any]:
     """What changed from one pass to the next, and which of them explains the raw images better."""
-    was = judge_stage(run, name, before.tracks, before.shapes, masks).counts
-    now = judge_stage(run, name, after.tracks, after.shapes, masks).counts
-    shares = [now[k] / was[k] - 1 for k in ("depth_m", "mask", "color") if was[k] and now[k] is not None]
+    learned = held_out_model(run, name, before.tracks, before.shapes)
+    was, now = (
+        {
+            **judge_stage(run, name, x.tracks, x.shapes, masks).counts,
+            "contact_j": held_out_loss_j(run, name, x.tracks, x.shapes, learned),
+        }
+        for x in (before, after)
+    )
+    shares = [now[k] / was[k] - 1 for k in EVIDENCE if was[k] and now[k] is not None]
     if now["frames"] + now["lost"]:
         shares.append((now["lost"] - was["lost"]) / (now["frames"] + now["lost"]))
     turned, moved = pose_change(before.tracks, after.tracks)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from processing.stage import Counts, Done
 from processing.vision import CAMERA
 from recordings.errors import BadInput
-from recordings.results import read_shape, read_track, write_contact, write_shape
+from recordings.results import read_contact, read_shape, read_track, write_contact, write_shape
 from recordings.session_writer import write_json
 from recordings.tracks import ObjectShape
 
@@ -98,6 +99,53 @@ def rollout_stage(run: Run, name: str, tracks: Mapping[int, Done], shape: Done) 
         return {"tosses": len(figure.estimated.errors.tosses)}
 
     return run.store.run("rollout", 1, run.config.contact, inputs, compute)
+
+
+LEAST_HELD_OUT = 4
+"""Tosses from which on half of them are kept for judging: learned from fewer than two, friction is hardly known."""
+
+
+def held_out_model(run: Run, name: str, tracks: Mapping[int, Done], shapes: Mapping[int, Done]) -> Done | None:
+    """Contact learned from every other toss, to judge the rest by; None where tosses are too few, do not share a shape,
+    or show no contact."""
+    if len(tracks) < LEAST_HELD_OUT or len({s.key for s in shapes.values()}) > 1:
+        return None
+    half = {t: tracks[t] for t in sorted(tracks)[::2]}
+    learned = contact_stage(run, f"{name}, every other one", half, next(iter(shapes.values())))
+    return None if learned.counts.get("kept_out") else learned
+
+
+def held_out_loss_j(
+    run: Run, name: str, tracks: Mapping[int, Done], shapes: Mapping[int, Done], learned: Done | None
+) -> float | None:
+    """Mean contact loss (J) of the tosses that `held_out_model` left out, of a shape at given poses; None without it or
+    where none of them can be used."""
+    if learned is None:
+        return None
+    rest = {t: tracks[t] for t in sorted(tracks)[1::2]}
+    done = held_out_stage(run, name, rest, next(iter(shapes.values())), learned)
+    loss = done.counts.get("loss_j")
+    return None if loss is None else float(loss)
+
+
+def held_out_stage(run: Run, name: str, tracks: Mapping[int, Done], shape: Done, learned: Done) -> Done:
+    """Stage `held-out`: the contact loss per toss, with friction and inertia learned from others."""
+    inputs = {"shape": shape.key, "learned": learned.key, **{f"track_{t:02d}": d.key for t, d in tracks.items()}}
+    inputs |= {"calibration": run.keys["calibration"]}
+
+    def compute(folder: Path) -> Counts:
+        from processing.contact.judge import contact_loss_of, mean_loss_j
+
+        world_from_camera = run.session.calibration.transform("world", CAMERA)
+        poses = {t: read_track(d.folder, t) for t, d in tracks.items()}
+        try:
+            losses = contact_loss_of(poses, read_shape(shape.folder), read_contact(learned.folder), world_from_camera)
+        except BadInput as why:
+            return {"kept_out": str(why)}
+        write_json(folder / "losses.json", {str(t): asdict(x) for t, x in losses.items()})
+        return {"loss_j": mean_loss_j(losses), "tosses": len(losses)}
+
+    return run.store.run("held-out", 1, {}, inputs, compute)
 
 
 NO_PLANE = (

@@ -33,7 +33,7 @@ Start = Literal["anew", "poses", "shape"]
 @dataclass(frozen=True)
 class CycleConfig:
     """The cycle's settings. A pass counts as worse than the one before when its residuals on the raw images are, on
-    average over depth, outline and colour, larger by more than `worse_share`."""
+    average over depth, outline, colour and contact, larger by more than `worse_share`."""
 
     icp: IcpConfig = field(default_factory=IcpConfig)
     redraw: RedrawConfig = field(default_factory=RedrawConfig)
