@@ -17,7 +17,7 @@ from processing.truth import open_truth
 from recordings.progress import Silent
 from recordings.results import read_shape, write_shape, write_track
 from recordings.session import Session
-from recordings.tracks import ObjectShape, ObjectTrack
+from recordings.tracks import ObjectShape, ObjectTrack, Status
 
 SAMPLE = Path(__file__).resolve().parents[2] / "recordings" / "samples" / "box_toss"
 
@@ -37,13 +37,14 @@ def true_tracks(run: Run) -> dict[int, Done]:
     for toss in run.tosses:
         times_ns = run.frames(toss).times_ns
         n = len(times_ns)
+        nowhere: tuple[Status, ...] = ("lost",) * n
         empty = ObjectTrack(
-            toss, "d455", "object", times_ns, np.full((n, 4, 4), np.nan), ("lost",) * n, np.full((n, 6, 6), np.nan)
+            toss, "d455", "object", times_ns, np.full((n, 4, 4), np.nan), nowhere, np.full((n, 6, 6), np.nan)
         )
         poses = truth.camera_from_object(empty)
         assert poses is not None
         covariance = np.tile(np.diag([1e-5] * 3 + [1e-7] * 3), (n, 1, 1))
-        status = tuple("tracked" if np.isfinite(p).all() else "lost" for p in poses)
+        status: tuple[Status, ...] = tuple("tracked" if np.isfinite(p).all() else "lost" for p in poses)
         found[toss] = stored_track(run, replace(empty, camera_from_object=poses, status=status, covariance=covariance))
     return found
 
