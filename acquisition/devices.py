@@ -162,7 +162,8 @@ class JointTrajectory:
 class Motion:
     """What became of the last trajectory. `ticks`: control cycles run; `missed`: cycles that the client reported late.
 
-    `reason` says in words why an aborted motion ended. Host times are `time.monotonic_ns()`.
+    `reason` says in words why an aborted motion ended. Host times are `time.monotonic_ns()`; `started_host_ns` is when
+    the arm passes the trajectory's time 0 (what it follows late is in it).
     """
 
     status: Literal["none", "moving", "done", "aborted"]

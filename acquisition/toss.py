@@ -9,14 +9,13 @@ jerk-limited (ruckig), all joints in step. What breaks a limit is refused with t
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray as Array
 
 from acquisition.devices import JointTrajectory
+from acquisition.dynamics import torques
 from acquisition.kinematics import Batch, joint_bounds
 from acquisition.rig import TossConfig
 from acquisition.toss_limits import SHARE, ArmModel
@@ -37,7 +36,6 @@ STAND_S = 0.05
 CLEARANCE_M = 0.01
 TABLE_CLEARANCE_M = 0.015
 SEEDS = 12
-PAYLOAD_KG = 0.3
 NUMERIC_SLACK = 1e-6
 
 
@@ -194,13 +192,12 @@ def check_limits(model: ArmModel, samples: Samples) -> Breach | None:
         ("acceleration", "rad/s2", np.abs(samples.ddq), model.acceleration),
         ("jerk", "rad/s3", np.abs(jerk), model.jerk),
     ]
-    if model.urdf_dynamics:
-        torque = torques(model, samples)
-        rate = np.diff(torque, axis=0) / np.diff(samples.time_s)[:, None]
-        rows += [
-            ("torque", "Nm", np.abs(torque), model.torque_nm),
-            ("torque rate", "Nm/s", np.abs(rate), model.torque_rate_nm_s),
-        ]
+    torque = torques(model, samples.q, samples.dq, samples.ddq)
+    rate = np.diff(torque, axis=0) / np.diff(samples.time_s)[:, None]
+    rows += [
+        ("torque", "Nm", np.abs(torque), model.torque_nm),
+        ("torque rate", "Nm/s", np.abs(rate), model.torque_rate_nm_s),
+    ]
     for what, unit, values, limits in rows:
         breach = _breach(model, what, unit, samples.time_s, values, limits)
         if breach is not None:
@@ -211,35 +208,6 @@ def check_limits(model: ArmModel, samples: Samples) -> Breach | None:
 def _off_middle(q: Float[Array, "n j"], low: Float[Array, " j"], high: Float[Array, " j"]) -> Float[Array, "n j"]:
     """How far each joint is from the middle of its range."""
     return np.abs(q - (low + high) / 2)
-
-
-def torques(model: ArmModel, samples: Samples) -> Float[Array, "n j"]:
-    """Joint torques by inverse dynamics (pinocchio), with the object and the hand; without friction."""
-    import pinocchio as pin
-
-    dynamics, data = _dynamics(model.name)
-    extra = dynamics.nv - model.joints
-    pad = np.zeros(extra)
-    return np.array(
-        [
-            pin.rnea(dynamics, data, np.append(q, pad), np.append(dq, pad), np.append(ddq, pad))[: model.joints]
-            for q, dq, ddq in zip(samples.q, samples.dq, samples.ddq)
-        ]
-    )
-
-
-@cache
-def _dynamics(name: str) -> tuple[Any, Any]:
-    import pinocchio as pin
-
-    from recordings.robot import panda_urdf
-
-    assert name == "panda"
-    dynamics = pin.buildModelFromUrdf(str(panda_urdf()))
-    hand = dynamics.frames[dynamics.getFrameId("panda_hand_tcp")]
-    ball = pin.Inertia.FromSphere(PAYLOAD_KG, 0.04)
-    dynamics.appendBodyToJoint(hand.parentJoint, ball, hand.placement)
-    return dynamics, dynamics.createData()
 
 
 def _releases(

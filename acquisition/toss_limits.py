@@ -27,11 +27,21 @@ class Capsule:
     radius_m: float
 
 
+@dataclass(frozen=True)
+class Body:
+    """Mass of a link, its centre in the link's frame, its inertia about the centre: xx, yy, zz, xy, xz, yz."""
+
+    link: str
+    mass_kg: float
+    centre_m: tuple[float, float, float]
+    inertia_kgm2: tuple[float, float, float, float, float, float]
+
+
 @dataclass(frozen=True, eq=False)
 class ArmModel:
     """An arm as the planner sees it. Limits per joint, from the base on; `tool` is the link that holds the object.
 
-    `torque_nm` and `torque_rate_nm_s` are checked where `urdf_dynamics` says that the model knows its masses.
+    `bodies` are the masses that torques are computed from (acquisition/dynamics.py); none: they are the URDF's.
     """
 
     name: str
@@ -46,8 +56,8 @@ class ArmModel:
     torque_nm: Float[Array, " j"]
     torque_rate_nm_s: Float[Array, " j"]
     capsules: tuple[Capsule, ...]
-    urdf_dynamics: bool
     source: str
+    bodies: tuple[Body, ...] = ()
 
     @property
     def joints(self) -> int:
@@ -107,7 +117,6 @@ def panda_model() -> ArmModel:
             Capsule("panda_hand", (0.0, -0.05, 0.04), (0.0, 0.05, 0.04), 0.04),
             Capsule("panda_hand", (0.0, -0.04, 0.085), (0.0, 0.04, 0.085), 0.02),
         ),
-        urdf_dynamics=True,
         source="libfranka 0.9 rate_limiting.h; Franka control parameters of the Panda (FER)",
     )
 
@@ -121,6 +130,16 @@ UR5E_DH = (
     (0.0996, 0.0, 0.0),
 )
 """d (m), a (m), alpha (rad) of each joint, as Universal Robots publishes them for the UR5e."""
+UR5E_BODIES = (
+    Body("link1", 3.761, (0.0, -0.02561, 0.00193), (0.00700, 0.00648, 0.00657, 0.0, -0.00001, 0.00050)),
+    Body("link2", 8.058, (0.2125, 0.0, 0.11336), (0.01506, 0.33388, 0.33247, -0.00005, 0.00001, 0.0)),
+    Body("link3", 2.846, (0.15, 0.0, 0.0265), (0.00400, 0.07879, 0.07849, -0.00001, 0.00137, -0.00001)),
+    Body("link4", 1.37, (0.0, -0.0018, 0.01634), (0.00165, 0.00136, 0.00126, 0.0, 0.0, 0.00010)),
+    Body("link5", 1.3, (0.0, 0.0018, 0.01634), (0.00136, 0.00128, 0.00097, 0.0, 0.0, -0.00005)),
+    Body("link6", 0.365, (0.0, 0.0, -0.001159), (0.00019, 0.00019, 0.00026, 0.0, 0.0, 0.0)),
+    Body("tool", 1.0, (0.0, 0.0, -0.09), (0.0018, 0.0018, 0.0008, 0.0, 0.0, 0.0)),
+)
+"""The links as Universal Robots publishes them (frames of UR5E_DH), and a usual gripper of 1 kg."""
 UR_TOOL_M = 0.15
 """From the flange to between the fingers of a usual gripper (Robotiq 2F-85, Hand-E: 0.13 to 0.17)."""
 
@@ -149,8 +168,8 @@ def ur5e_model() -> ArmModel:
             Capsule("link5", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.05),
             Capsule("link6", (0.0, 0.0, 0.0), (0.0, 0.0, UR_TOOL_M - 0.04), 0.06),
         ),
-        urdf_dynamics=False,
-        source="Universal Robots' data sheet; acceleration and jerk chosen here",
+        source="Universal Robots' data sheet and its page of DH parameters; acceleration and jerk chosen here",
+        bodies=UR5E_BODIES,
     )
 
 

@@ -3,7 +3,7 @@
 ur-rtde speaks with Universal Robots' controllers only; it does not drive the Franka Panda, which has a driver of its
 own (acquisition.drivers.franka). It runs in a process of its own: it crashes the interpreter when a connection breaks
 in the wrong moment, and its servo loop shall not wait for anybody.
-servoJ follows with the delay of its look-ahead time (30 ms at least): a toss counts on it in its release delay.
+servoJ follows with the delay of its look-ahead time (30 ms at least): `Motion.started_host_ns` is later by it.
 """
 
 from __future__ import annotations

@@ -155,7 +155,8 @@ class Follower:
         self._path = from_here(path, here, self._rate_hz)
         self._brake: Brake | None = None
         self._began_s = time.monotonic()
-        self._started = time.monotonic_ns()
+        # the arm passes the path's start when it has caught up with its look-ahead
+        self._started = time.monotonic_ns() + round(options["lookahead_s"] * 1e9)
         self._tick = -1
         self._place = 0.0
         self._ticks = self._missed = 0

@@ -29,8 +29,8 @@ SMALL = SyntheticConfig(
 pytestmark = pytest.mark.filterwarnings("error::pytest.PytestUnhandledThreadExceptionWarning")
 
 
-BUSY_S = 2.0
-"""How long a busy machine may stop this process."""
+HANGS_S = 2.0
+"""Nothing takes longer than this beyond a take's own length, on a machine that is free (conftest.OwnTime)."""
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ def test_a_fault_has_its_verdict_and_nothing_is_lost_in_silence(case: Case, reco
     done = record(inject, seconds=seconds)
     assert done.take.decision == case.decision, done.take.verdict.text()
     assert case.says in done.take.verdict.text()
-    assert done.seconds < seconds + 2.0 + BUSY_S
+    assert done.seconds < seconds + HANGS_S
     assert_everything_is_counted(done)
 
 

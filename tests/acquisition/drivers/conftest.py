@@ -9,11 +9,14 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from acquisition.simulators.apart import Apart
 from acquisition.simulators.gige import PROGRAM
 from acquisition.simulators.network import NotPermitted, own_network
+from recordings.records import ArmStates
+from recordings.session_writer import SessionWriter
 
 _COUNT = itertools.count(1)
 
@@ -108,3 +111,24 @@ def shipped_session() -> Path:
     import recordings
 
     return Path(recordings.__file__).parent / "samples" / "box_toss"
+
+
+@pytest.fixture(scope="session")
+def arm_session(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Half a minute of an arm that sways, its fingers opening and closing."""
+    folder = tmp_path_factory.mktemp("arm") / "session"
+    time_s = np.arange(0, 30, 0.01)
+    q = np.sin(time_s)[:, None] * np.linspace(0.1, 0.4, 7)
+    width_m = 0.04 + 0.03 * np.sin(2 * time_s)
+    states = ArmStates(
+        np.rint(1e9 * (1 + time_s)).astype(np.int64),
+        tuple(f"panda_joint{k}" for k in range(1, 8)),
+        q,
+        np.gradient(q, time_s, axis=0),
+        width_m,
+    )
+    with SessionWriter(folder, {"rig": {"arm": "franka_panda"}}) as session:
+        with session.toss(0) as toss:
+            toss.arm(states)
+        session.finish()
+    return folder
