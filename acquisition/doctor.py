@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import resource
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
 from acquisition.preflight import Preflight, Row
+from acquisition.streams import READS
 from recordings.errors import DeviceNotFound
 
 USBFS = Path("/sys/module/usbcore/parameters/usbfs_memory_mb")
@@ -83,6 +85,7 @@ def system() -> Iterator[Row]:
         yield Row("system", "usbfs memory", state, f"{megabytes} MB", fix)  # type: ignore[arg-type]
     cores = len(os.sched_getaffinity(0))
     yield Row("system", "cores", "ok" if cores >= 2 else "warning", str(cores), "two or more")
+    yield priority()
     realtime = "PREEMPT_RT" in os.uname().version or "PREEMPT RT" in os.uname().version
     found = "real-time" if realtime else "not real-time: a Franka's 1 kHz loop may miss cycles"
     yield Row("system", "kernel", "ok" if realtime else "warning", found, "apt-get install -y linux-image-rt-amd64")
@@ -90,6 +93,15 @@ def system() -> Iterator[Row]:
     if governors and governors != {"performance"}:
         fix = "sudo cpupower frequency-set -g performance"
         yield Row("system", "cpu governor", "warning", ", ".join(sorted(governors)), fix)
+
+
+def priority() -> Row:
+    """Whether the recorder's threads may run before other programs' (streams.go_first)."""
+    allowed = resource.getrlimit(resource.RLIMIT_NICE)[0]
+    may = os.geteuid() == 0 or allowed == resource.RLIM_INFINITY or 20 - allowed <= READS
+    found = "before other programs" if may else "like any other program: frames are lost on a busy machine"
+    fix = f'echo "$USER - nice {READS}" | sudo tee /etc/security/limits.d/toss-record.conf, then log in anew'
+    return Row("system", "priority", "ok" if may else "warning", found, fix)
 
 
 def room(folder: Path) -> Iterator[Row]:

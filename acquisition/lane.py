@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from acquisition.clock import ClockLine
-from acquisition.streams import BoundedQueue, Counter
+from acquisition.streams import WRITES, BoundedQueue, Counter, go_first
 from recordings.errors import BadInput, TosslabError, WriteFailed
 from recordings.session_writer import TossWriter
 
@@ -91,6 +91,7 @@ class Lane:
         return self._queue.fullest
 
     def _run(self) -> None:
+        go_first(WRITES)
         while not self._queue.closed:
             got = self._queue.take(WAIT_S)
             if isinstance(got, threading.Event):

@@ -40,7 +40,7 @@ from acquisition.devices import (
 from acquisition.gate import Gate, Trouble
 from acquisition.lane import Item, Lane, Take, Write
 from acquisition.rig import DeviceEntry, Rig
-from acquisition.streams import Tally
+from acquisition.streams import READS, Tally, go_first
 from recordings import arm_codec
 from recordings.errors import DeviceNotFound, TosslabError
 from recordings.records import ArmStates, DepthImage, EncodedImage
@@ -52,6 +52,8 @@ LATE_S = 0.06
 """How long after a take's end its last frames may still come in from the pumps."""
 ARM_HOLD_S = 0.15
 """Joint states wait for the gripper's next width before they are written."""
+ARM_QUEUE_S = 10.0
+"""Joint states are small: a slow disk shall not cost any."""
 LOOK_WIDTH = 212
 DESIRED_TOPIC = "/arm/desired_joint_states"
 STOPPED_MODES: tuple[ArmMode, ...] = ("reflex", "user_stopped", "error")
@@ -294,8 +296,10 @@ class Recorder:
             kind = "arm" if entry.kind == "arm" else topic.rsplit("/", 1)[1]
             write = writes.get(kind, self._write_mono)
             hold_s = ARM_HOLD_S if entry.kind == "arm" and self.rig.of_kind("gripper") else 0.0
-            rate = 100.0 if entry.kind == "arm" else entry.rate_hz
-            self.lanes[topic] = Lane(topic, rate, r.queue_s, r.pre_trigger_s + hold_s, _bound(write, entry), hold_s)
+            rate, queue_s = entry.rate_hz, r.queue_s
+            if entry.kind == "arm":
+                rate, queue_s = 100.0, max(r.queue_s, ARM_QUEUE_S)
+            self.lanes[topic] = Lane(topic, rate, queue_s, r.pre_trigger_s + hold_s, _bound(write, entry), hold_s)
             if entry.kind != "arm":
                 self._gates[topic] = Gate(topic, self.lanes[topic].counter, period_ns=1e9 / entry.rate_hz)
 
@@ -377,6 +381,7 @@ class _Pump(threading.Thread):
         self._recorder, self._entry, self._device = recorder, entry, device
 
     def run(self) -> None:
+        go_first(READS)
         stop = self._recorder._stop
         while not stop.is_set():
             try:

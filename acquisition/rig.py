@@ -48,8 +48,8 @@ class RecordingConfig:
     pre_trigger_s: float = 0.5
     after_rest_s: float = 0.4
     longest_toss_s: float = 12.0
-    queue_s: float = 0.8
-    """What a stream's queue holds before frames are dropped."""
+    queue_s: float = 1.5
+    """What a stream's queue holds before frames are dropped; the lab's cameras send 208 MB a second."""
     reserve_gb: float = 1.0
     """Disk space that is never used."""
     color_jpeg_quality: int = 95

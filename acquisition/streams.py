@@ -6,6 +6,8 @@ When a recorder has stopped nothing waits any more: received = written + dropped
 
 from __future__ import annotations
 
+import contextlib
+import os
 import threading
 from collections import deque
 from collections.abc import Mapping
@@ -13,7 +15,15 @@ from dataclasses import dataclass, field
 from typing import Generic, Literal, TypeVar
 
 T = TypeVar("T")
+READS, WRITES = -10, -5
+"""How nice the threads that read devices are to other programs, and those that encode and write."""
 Cause = Literal["queue full", "duplicate", "out of order", "invalid", "write failed", "too late"]
+
+
+def go_first(niceness: int) -> None:
+    """Let the calling thread run before other programs', where this user may (root, or a limit on `nice`)."""
+    with contextlib.suppress(OSError):
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), niceness)
 
 
 @dataclass(frozen=True)
