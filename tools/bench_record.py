@@ -8,6 +8,8 @@ python tools/bench_record.py detect [--count 200]       # release and impact of 
 python tools/bench_record.py plans [--count 1000]       # random targets: every accepted plan within its limits
 python tools/bench_record.py tags                       # what JPEG does to tag corners in mono images, size and cost
 python tools/bench_record.py faults                     # the injected faults, as tests/acquisition/test_faults.py
+
+kill, detect and plans take --part K/N: the K-th of N shares of the same draws, for machines that others use too.
 """
 
 # long because: eight measurements, each a few functions
@@ -83,7 +85,13 @@ def rig(config: SyntheticConfig, **recording: Any) -> Rig:
 
 
 def record(
-    config: SyntheticConfig, folder: Path, seconds: float, tosses: int, each: Any = None, **recording: Any
+    config: SyntheticConfig,
+    folder: Path,
+    seconds: float,
+    tosses: int,
+    each: Any = None,
+    warm_up_s: float = 2.0,
+    **recording: Any,
 ) -> Any:
     """Takes of a fixed length; `each(run, report)` after every one. Returns report, tallies, clocks, recorder."""
     lab, a_rig = SyntheticLab(config), rig(config, **recording)
@@ -92,7 +100,7 @@ def record(
     devices = {d.name: lab.device(d.name, d.kind, d.rate_hz) for d in a_rig.devices}
     recorder = Recorder(a_rig, devices, SessionClock(time.monotonic_ns(), time.time_ns()))
     with recorder:
-        time.sleep(2.0)
+        time.sleep(warm_up_s)
         with SessionWriter(folder, {"object": {"name": "bench"}}, lab.show.calibration()) as session:
             run = SessionRun(recorder, thrower, session, lab.show.calibration(), Quiet(), Silent())
             reports = []
@@ -161,37 +169,49 @@ def bench_soak(seconds: float) -> bool:
     return growth < 50 and unaccounted == 0
 
 
-def bench_kill(count: int) -> bool:
-    rng, good, lost_frames = random.Random(4), 0, []
-    for k in range(count):
-        with tempfile.TemporaryDirectory() as place:
+def share(count: int, part: str) -> range:
+    """The numbers of the K-th of N shares, for `part` = "K/N"."""
+    k, n = (int(number) for number in part.split("/"))
+    return range((k - 1) * count // n, k * count // n)
+
+
+def bench_kill(count: int, part: str) -> bool:
+    numbers, good, cut = share(count, part), 0, 0
+    for k in numbers:
+        with tempfile.TemporaryDirectory(dir=os.environ.get("TMPDIR")) as place:
             folder = Path(place) / "session"
-            child = subprocess.Popen([sys.executable, __file__, "child", str(folder)], cwd=ROOT)
-            while not (folder / "toss_00.mcap").exists():
-                time.sleep(0.02)
-            time.sleep(rng.uniform(0.0, 4.0))
-            os.kill(child.pid, signal.SIGKILL)
-            child.wait()
+            after_s = random.Random(k).uniform(0.0, 4.0)
+            killed_after(folder, after_s)
             sealed = {p.name: file_sha256(p) for p in folder.glob("toss_*.mcap") if verify(p).ok}
             session, recovered = resume_session(folder)
             with session:
-                number = next_toss(folder)
-                with session.toss(number) as toss:
+                with session.toss(next_toss(folder)) as toss:
                     toss.dropped("/d455/color", 0)
                 session.finish()
             untouched = all(file_sha256(folder / name) == sha for name, sha in sealed.items())
             whole = verify(folder).ok
             good += untouched and whole
-            lost_frames.append(sum(1 for r in recovered))
+            cut += len(recovered)
             if not (untouched and whole):
-                print(f"  kill {k}: untouched {untouched}, whole {whole}: {verify(folder)}")
-    print(f"kill -9: {good} of {count} sessions recovered, finished tosses untouched, resumed (wanted: all)")
-    return good == count
+                print(f"  kill {k} after {after_s:.3f} s: untouched {untouched}, whole {whole}: {verify(folder)}")
+    print(f"kill -9 at {len(numbers)} random instants: {good} sessions recovered with all files, finished tosses")
+    print(f"  untouched, resumed (wanted: all); {cut} of the kills cut a file off")
+    return good == len(numbers)
 
 
-def child(folder: Path) -> None:
-    """Records short takes until it is killed."""
-    record(TINY, folder, 0.8, 1000)
+def killed_after(folder: Path, seconds: float) -> None:
+    """A process of its own records short takes until it is killed, `seconds` after its session began."""
+    child = os.fork()
+    if child == 0:
+        try:
+            record(TINY, folder, 0.8, 1000, warm_up_s=0.3)
+        finally:
+            os._exit(1)
+    while not (folder / "session.json").exists():
+        time.sleep(0.01)
+    time.sleep(seconds)
+    os.kill(child, signal.SIGKILL)
+    os.waitpid(child, 0)
 
 
 def bench_clock() -> bool:
@@ -231,13 +251,15 @@ def clock_run(
     return mapper, np.array(errors)
 
 
-def bench_detect(count: int) -> bool:
+def bench_detect(count: int, part: str) -> bool:
     """Motions of the simulated lab, depth at thumbnail size, widths at 50 Hz: nothing else is rendered."""
-    per_lab = 50
+    per_lab = 25
     hits: Counter[str] = Counter()
     early, done = 0, 0
-    for seed in range(11, 11 + -(-count // per_lab)):
-        for off, late_s in toss_by_toss(seed, min(per_lab, count - done)):
+    numbers = share(count, part)
+    for seed in sorted({11 + k // per_lab for k in numbers}):
+        tosses = [k % per_lab for k in numbers if 11 + k // per_lab == seed]
+        for off, late_s in toss_by_toss(seed, tosses):
             done += 1
             for name, error in off.items():
                 hits[name] += error is not None and abs(error) <= 1.0
@@ -249,7 +271,7 @@ def bench_detect(count: int) -> bool:
     return min(hits["release"], hits["first impact"]) >= 0.98 * done
 
 
-def toss_by_toss(seed: int, count: int) -> Any:
+def toss_by_toss(seed: int, tosses: list[int]) -> Any:
     from acquisition.synthetic.show import Show
 
     show = Show(SyntheticConfig(seed=seed, color_size=(212, 120)))
@@ -262,7 +284,7 @@ def toss_by_toss(seed: int, count: int) -> Any:
         arm_model("panda"),
         Transform("world", "base", base.rotation, base.translation_m),
     )
-    for toss in range(count):
+    for toss in tosses:
         motion = show.motion(toss, show.plan(toss))
         rng = np.random.default_rng((seed, toss))
         end_s = motion.instants.end_s
@@ -294,15 +316,16 @@ def toss_by_toss(seed: int, count: int) -> Any:
         yield off, None if over_s is None else over_s - true.rest_s
 
 
-def bench_plans(count: int) -> bool:
+def bench_plans(count: int, part: str) -> bool:
     """Releases all over the table at up to 1.5 m/s, some of them impossible."""
-    good = True
+    good, numbers = True, share(count, part)
     for name in ("panda", "ur5e"):
-        rng, model = np.random.default_rng(0), arm_model(name)
+        model = arm_model(name)
         base = Transform("world", "base", rotation_exp(np.array([0.0, 0.0, -np.pi / 2])), np.array([0.0, 0.6, 0.0]))
         accepted, broken, why = 0, 0, Counter[str]()
         started = time.process_time()
-        for _ in range(count):
+        for number in numbers:
+            rng = np.random.default_rng((0, number))
             config = TossConfig(
                 position_m=tuple(rng.uniform([-0.25, -0.1, 0.15], [0.25, 0.3, 0.55]).tolist()),
                 velocity_m_s=tuple(rng.uniform([-0.6, -1.2, -0.3], [0.6, 0.2, 1.0]).tolist()),
@@ -327,11 +350,11 @@ def bench_plans(count: int) -> bool:
                 print(f"  {breach}")
         good &= broken == 0
         print(
-            f"{name}: {accepted} of {count} random releases accepted, {broken} of them break a limit (wanted: 0), "
-            f"{(time.process_time() - started) / count:.2f} CPU-s each"
+            f"{name}: {accepted} of {len(numbers)} random releases accepted, {broken} of them break a limit "
+            f"(wanted: 0), {(time.process_time() - started) / len(numbers):.2f} CPU-s each"
         )
-        for text, number in why.most_common(6):
-            print(f"  refused {number}: {text}")
+        for text, times in why.most_common(8):
+            print(f"  refused {times}: {text}")
     return good
 
 
@@ -393,20 +416,18 @@ def bench_faults() -> bool:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", nargs="?", default="all")
-    parser.add_argument("place", nargs="?", type=Path)
     parser.add_argument("--seconds", type=float)
     parser.add_argument("--count", type=int)
+    parser.add_argument("--part", default="1/1", metavar="K/N")
     args = parser.parse_args()
-    if args.what == "child":
-        child(args.place)
     benches = {
         "clock": bench_clock,
-        "plans": lambda: bench_plans(args.count or 1000),
+        "plans": lambda: bench_plans(args.count or 1000, args.part),
         "tags": bench_tags,
         "rates": lambda: bench_rates(args.seconds or 60.0),
         "soak": lambda: bench_soak(args.seconds or 600.0),
-        "kill": lambda: bench_kill(args.count or 100),
-        "detect": lambda: bench_detect(args.count or 200),
+        "kill": lambda: bench_kill(args.count or 100, args.part),
+        "detect": lambda: bench_detect(args.count or 200, args.part),
         "faults": bench_faults,
     }
     chosen = list(benches) if args.what == "all" else [args.what]
