@@ -37,7 +37,7 @@ def true_tracks(run: Run) -> dict[int, Done]:
     for toss in run.tosses:
         times_ns = run.frames(toss).times_ns
         n = len(times_ns)
-        nowhere: tuple[Status, ...] = ("lost",) * n
+        nowhere: tuple[Status, ...] = tuple("lost" for _ in range(n))
         empty = ObjectTrack(
             toss, "d455", "object", times_ns, np.full((n, 4, 4), np.nan), nowhere, np.full((n, 6, 6), np.nan)
         )
