@@ -45,6 +45,8 @@ def _parser() -> Any:
                         "tags [{id, size_m, T_tagged_tag or T_object_tag}]")  # fmt: skip
     parser.add_argument("--family", default="tag36h11", help="tag family (default: %(default)s)")
     parser.add_argument("--ignore", type=int, nargs="+", default=[], metavar="ID", help="tags to leave out")
+    parser.add_argument("--mono-only", action="store_true", help="leave out the D455's own view of the tags, which "
+                        "otherwise places it next to impacts")  # fmt: skip
     parser.add_argument("--toss", metavar="I[-J]", help="only these tosses (default: all with mono images)")
     parser.add_argument("--mesh", type=Path, metavar="FILE", help="the object's known shape, metres: goes into truth/, "
                         "and the tags are laid on it")  # fmt: skip
@@ -101,7 +103,9 @@ def _work(args: argparse.Namespace) -> Outcome:
         if out.exists() and not args.replace:
             raise BadInput(f"{out} exists; nothing was written. Type --replace to make it anew, or `--out FOLDER`")
         sizes, layout = _layout(args.layout) if args.layout else (None, None)
-        config = TruthConfig(args.family, args.tag_size, frozenset(args.ignore), layout, sizes)
+        config = TruthConfig(
+            args.family, args.tag_size, frozenset(args.ignore), layout, sizes, mono_only=args.mono_only
+        )
         tosses = _tosses(session, args.toss)
         truth = find_truth(session, tosses, config, progress_for("toss-truth"))
         offset, notes = _offset(args, truth)

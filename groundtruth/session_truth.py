@@ -8,9 +8,9 @@ import json
 import shutil
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int64
@@ -18,7 +18,6 @@ from numpy import ndarray as Array
 
 from groundtruth import se3
 from groundtruth.answer import pose_rows, reprojection
-from groundtruth.interpolate import classify, interpolate
 from groundtruth.offset import Fit, object_from_tagged_by_mesh, tagged_frame
 from groundtruth.session_sightings import (
     assign_roles,
@@ -30,7 +29,9 @@ from groundtruth.session_sightings import (
     triangulated_tags,
 )
 from groundtruth.session_solve import Solved, solve_session
+from groundtruth.toss_truth import TossTruth, TrackedLimits, at_color_frames
 from groundtruth.verdict import Verdict, judge
+from groundtruth.witness import Witness, WitnessConfig, witness
 from recordings.errors import BadInput
 from recordings.geometry import Transform
 from recordings.progress import Progress, Silent
@@ -55,19 +56,9 @@ class TruthConfig:
     """Images of different cameras nearer than this are one instant."""
     size_trust: float = 0.015
     """A given tag size may differ from the measured one by this share: corners of small tags lie a little inside."""
-    tracked_m: float = 0.0015
-    tracked_rad: float = 0.01
-    """A pose is `tracked` when its standard deviations (over all axes) are below these, else `interpolated`."""
-
-
-@dataclass(frozen=True, eq=False)
-class TossTruth:
-    """The body at the D455's colour frames; NaN where lost. Covariances are in the world: (rotation, translation)."""
-
-    time_ns: Int64[Array, " n"]
-    world_from_tagged: Float[Array, "n 4 4"]
-    covariance: Float[Array, "n 6 6"]
-    status: tuple[Literal["tracked", "interpolated", "lost"], ...]
+    limits: TrackedLimits = field(default_factory=TrackedLimits)
+    mono_only: bool = False
+    """Leave out what the D455 itself saw of the tags next to impacts."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,6 +67,7 @@ class SessionTruth:
     tosses: Mapping[int, TossTruth]
     verdict: Verdict
     sizes_m: Mapping[int, float]
+    witness: Witness | None = None
 
 
 def find_truth(
@@ -97,14 +89,34 @@ def find_truth(
     known |= {i: s for i, s in sizes.items() if i in _given(config, roles.body)}
     short_px = shrink_px(triangulated, known)
     sightings = grown(sightings, short_px)
-    size_notes += [f"tags' edges appear {short_px:.2f} px short; corners moved outwards by that"] if short_px else []
+    size_notes += (
+        [f"tags' edges appear {short_px:.2f} px short; corners moved outwards by that"]
+        if abs(short_px) >= 0.005
+        else []
+    )
     solved = _in_tagged_frame(
         solve_session(sightings, roles, sizes, calibration, config.layout, progress=progress), config
     )
     size_notes += [f"time offset of the mono cameras applied: {offset_ns / 1e6:.2f} ms"] if offset_ns else []
-    verdict = judge(solved, sightings, spread_ns, size_notes, calibration)
-    truths = {toss: _at_color_frames(session, toss, solved, config) for toss in tosses}
-    return SessionTruth(solved, truths, verdict, sizes)
+    truths = {t: at_color_frames(t, session.toss(t).color().times_ns, solved, config.limits) for t in tosses}
+    own = None
+    if not config.mono_only:
+        own = witness(session, truths, solved, config.limits, WitnessConfig(config.family), progress)
+    notes = [*size_notes, *_witness_notes(truths, own)]
+    verdict = judge(solved, sightings, spread_ns, notes, calibration)
+    return SessionTruth(solved, own.tosses if own is not None else truths, verdict, sizes, own)
+
+
+def _witness_notes(truths: Mapping[int, TossTruth], own: Witness | None) -> list[str]:
+    """What the D455's own view of the tags was good for."""
+    still_open = sum(int(t.open.sum()) for t in truths.values())
+    if own is None:
+        return [f"next to impacts {still_open} poses are interpolated between the triggers"] if still_open else []
+    return [
+        f"next to impacts {own.frames} of {still_open} poses are placed by the tags in the colour images themselves "
+        f"(median {own.corner_px:.2f} px at sure poses; the D455 stands {1000 * own.off_m:.2f} mm and "
+        f"{np.degrees(own.off_rad):.3f} deg from its place)"
+    ]
 
 
 def _sizes(
@@ -166,39 +178,6 @@ def _in_tagged_frame(solved: Solved, config: TruthConfig) -> Solved:
     center = new_from_old[:3, :3] @ solved.center_m + new_from_old[:3, 3]
     layout = {i: new_from_old @ pose for i, pose in solved.layout.items()}
     return replace(solved, tracks=tracks, layout=layout, center_m=center)
-
-
-def _at_color_frames(session: Session, toss: int, solved: Solved, config: TruthConfig) -> TossTruth:
-    """The track at the D455's exposures (at the mono cameras' own, where there is no D455)."""
-    track = solved.tracks[toss]
-    recorded = session.toss(toss)
-    times_ns = recorded.color().times_ns
-    if len(times_ns) == 0:
-        times_ns = track.time_ns
-    start = int(track.time_ns[0]) if len(track.time_ns) else 0
-    motion = classify((track.time_ns - start) / 1e9, track.world_from_tagged, solved.center_m, track.on_arc)
-    found = interpolate(motion, (times_ns - start) / 1e9)
-    covariance = np.full((len(times_ns), 6, 6), np.nan)
-    status: list[Literal["tracked", "interpolated", "lost"]] = []
-    for i, pose in enumerate(found.poses):
-        if not np.isfinite(pose).all():
-            status.append("lost")
-            continue
-        own = _between(track.covariance, int(found.before[i]), float(found.weight[i]))
-        own[range(3), range(3)] += found.extra_rad[i] ** 2
-        own[range(3, 6), range(3, 6)] += found.extra_m[i] ** 2
-        turn = np.kron(np.eye(2), pose[:3, :3])
-        covariance[i] = turn @ own @ turn.T
-        turn_rad, shift_m = np.sqrt(np.trace(own[:3, :3])), np.sqrt(np.trace(own[3:, 3:]))
-        good = turn_rad <= config.tracked_rad and shift_m <= config.tracked_m
-        status.append("tracked" if good else "interpolated")
-    return TossTruth(times_ns, found.poses, covariance, tuple(status))
-
-
-def _between(covariance: Float[Array, "n 6 6"], before: int, weight: float) -> Float[Array, "6 6"]:
-    """Of a pose between two: as if what they share (cameras, layout) does not average out."""
-    a, b = covariance[max(before, 0)], covariance[min(before + 1, len(covariance) - 1)]
-    return ((1 - weight) * a + weight * b).copy()
 
 
 def fit_mesh(truth: SessionTruth, mesh_path: Path) -> Fit:
@@ -279,6 +258,7 @@ def truth_document(truth: SessionTruth, object_from_tagged: Transform | None) ->
         },
         "center_of_mass_tagged_m": solved.center_m.tolist(),
         "frames": {str(toss): _counts(t) for toss, t in truth.tosses.items()},
+        **({"d455_witness": truth.witness.document()} if truth.witness is not None else {}),
         "verdict": truth.verdict.document(),
     }
 

@@ -54,7 +54,8 @@ class Truth:
         return _at_frames(track.time_ns, times_ns, poses)
 
     def _session_poses(self, path: Path, camera: str) -> tuple[Int64[Array, " m"], Float[Array, "m 4 4"]]:
-        stamped = [p for p in Toss(path).poses("/groundtruth/pose") if p.status == "tracked"]
+        # next to impacts the truth itself is less sure ("interpolated"); leaving those frames out would flatter
+        stamped = [p for p in Toss(path).poses("/groundtruth/pose") if p.status != "lost"]
         object_from_tagged = self._object_from_tagged()
         poses = np.full((len(stamped), 4, 4), np.nan)
         for i, p in enumerate(stamped):
