@@ -238,7 +238,7 @@ class SessionClock:
 
     def __init__(self, base_host_ns: int, unix_ns: int, starts_at_ns: int = 0) -> None:
         self._base_host_ns = base_host_ns - starts_at_ns
-        self.anchor = {"session_ns": starts_at_ns, "unix_ns": unix_ns}
+        self.anchor = {"session_ns": starts_at_ns, "unix_ns": unix_ns, "host_monotonic_ns": base_host_ns}
 
     def session_ns(self, host_ns: int) -> int:
         """The session's time of a reading of `time.monotonic_ns()`."""

@@ -184,6 +184,7 @@ class McapWriter:
         self._end_watch()
         self._sink.sync()
         self._sink.close()
+        self._chunk_indexes.clear()  # a session keeps its writers for their counts
         self._sink.raise_latched()
         return self._sink.sha256
 

@@ -86,6 +86,8 @@ class SyntheticConfig:
     """Of the clocks of the RGBD camera, the grey cameras in turn (cyclic), the arm (last)."""
     latency_ms: float = 5.2
     """Smallest time from mid-exposure to receipt."""
+    mono_latency_ms: float | None = None
+    """The same of the grey cameras, where it is another."""
     latency_jitter_ms: float = 1.0
     """Mean of what comes on top (exponential)."""
     depth_delay_ms: float = 0.0
@@ -240,6 +242,8 @@ class _Camera(_Device):
         super().__init__(lab, name)
         self._streams = streams
         config = lab.config
+        own_ms = config.mono_latency_ms if streams[0].startswith("mono") else None
+        self._latency_ms = config.latency_ms if own_ms is None else own_ms
         self._clock = self._make_clock(config.skew_ppm[skew_number % len(config.skew_ppm)] * 1e-6)
         self._frame = 0
         self._arrived_ns = 0
@@ -275,7 +279,7 @@ class _Camera(_Device):
     def _skip_lost(self) -> None:
         """Frames that were not read in time, were lost on the way, or were never exposed."""
         stage, config = self._lab.stage, self._lab.config
-        newest = stage.frame_before(time.monotonic_ns() - round(config.latency_ms * 1e6))
+        newest = stage.frame_before(time.monotonic_ns() - round(self._latency_ms * 1e6))
         quiet = self._faults.active("lost_trigger") or self._faults.active("silence")
         if quiet and newest > self._frame:
             self._missed_triggers += newest - self._frame if self._faults.active("lost_trigger") else 0
@@ -295,9 +299,8 @@ class _Camera(_Device):
         return generator(self._lab.config.seed, 77, STREAM_SEEDS[self._streams[0]], frame & 0x7FFFFFFF)
 
     def _arrival_ns(self, frame: int) -> int:
-        config = self._lab.config
         exposed = max(self._lab.stage.exposed_ns(stream, frame) for stream in self._streams)
-        late_ms = config.latency_ms + self._draw(frame).exponential(config.latency_jitter_ms)
+        late_ms = self._latency_ms + self._draw(frame).exponential(self._lab.config.latency_jitter_ms)
         fault = self._faults.active("late")
         late_ms += 1e3 * fault.number("by_s", 0.05) if fault else 0.0
         return exposed + round(late_ms * 1e6)

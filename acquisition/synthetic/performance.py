@@ -46,6 +46,10 @@ class Performance:
     motion: Motion
     reels: dict[str, Reel]
 
+    def without_pictures(self) -> Performance:
+        """What is to be remembered of a toss that nobody will look at again: its motion and its times."""
+        return Performance(self.motion, {name: Reel(reel.times_s, [], [], []) for name, reel in self.reels.items()})
+
 
 def perform(lab: Lab, motion: Motion, fps: float, progress: Progress | None = None) -> Performance:
     """Render a toss for all cameras on a grid of `fps`; the colour camera's frames have the config's jitter."""

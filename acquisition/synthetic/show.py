@@ -171,8 +171,25 @@ class Show:
     def perform(self, toss: int, plan: TossPlan, progress: Progress | None = None) -> Performance:
         """What happens when the arm follows a plan, with a gripper that takes its own time; rendered."""
         if not self.rendered:
-            return _pool(self.config, plan.trajectory, self.phases_s())
+            return self._standing(plan)
         return perform(self.lab, self.motion(toss, plan), self.config.fps, progress)
+
+    def _standing(self, plan: TossPlan) -> Performance:
+        """The pool's pictures, in turn."""
+        motion = _still_motion(plan.trajectory.q_rad[[0, -1]])
+        assert isinstance(motion.swing, CommandedSwing)
+        motion = replace(motion, swing=replace(motion.swing, trajectory=plan.trajectory))
+        return Performance(motion, {name: Reel(np.zeros(0), [], p, p) for name, p in self._pool.items()})
+
+    @cached_property
+    def _pool(self) -> dict[str, list[Array]]:
+        rng = generator(self.config.seed, 81)
+        pictures = {}
+        for name in self.phases_s():
+            size = self.config.mono_size if name.startswith("mono") else self.config.color_size
+            draw = _depth if name.endswith("depth") else _texture
+            pictures[name] = [draw(rng, *size, name) for _ in range(POOL)]
+        return pictures
 
     def motion(self, toss: int, plan: TossPlan) -> Motion:
         """What arm and object do, not rendered."""
@@ -270,19 +287,6 @@ def _still_motion(q: Float[Array, "2 j"]) -> Motion:
     return Motion(0, still, Instants(0.0, 1.0, 1.3, 1.6, 2.0), 1.04, swing)
 
 
-def _pool(config: SyntheticConfig, trajectory: JointTrajectory, phases_s: dict[str, float]) -> Performance:
-    rng = generator(config.seed, 81)
-    motion = _still_motion(trajectory.q_rad[[0, -1]])
-    assert isinstance(motion.swing, CommandedSwing)
-    motion = replace(motion, swing=replace(motion.swing, trajectory=trajectory))
-    reels = {}
-    for name in phases_s:
-        size = config.mono_size if name.startswith("mono") else config.color_size
-        pictures = [_depth(rng, *size) if name.endswith("depth") else _texture(rng, *size, name) for _ in range(POOL)]
-        reels[name] = Reel(np.zeros(0), [], pictures, pictures)
-    return Performance(motion, reels)
-
-
 def _texture(rng: np.random.Generator, width: int, height: int, name: str) -> Array:
     """A picture with the texture and noise of a real sensor."""
     channels = 3 if name.endswith("color") else 1
@@ -292,7 +296,7 @@ def _texture(rng: np.random.Generator, width: int, height: int, name: str) -> Ar
     return np.ascontiguousarray(noisy.clip(0, 255).astype(np.uint8).squeeze())
 
 
-def _depth(rng: np.random.Generator, width: int, height: int) -> Array:
+def _depth(rng: np.random.Generator, width: int, height: int, name: str) -> Array:
     distance_m = np.linspace(1.4, 0.6, height)[:, None] + np.zeros((1, width))
     depth = np.rint(1000 * (distance_m + rng.normal(0, 0.0015, (height, width)) * distance_m**2))
     depth[cv2.resize(rng.random((12, 16)), (width, height)) > 0.75] = 0

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import threading
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -46,7 +46,8 @@ class Stage:
             now = self.frame_before(time.monotonic_ns()) + 1
             if self.shown and self.shown[-1].ended_frame is None:
                 last = self.shown[-1]
-                self.shown[-1] = Shown(last.performance, last.first_frame, now)
+                past = [replace(s, performance=s.performance.without_pictures()) for s in self.shown[:-1]]
+                self.shown = [*past, Shown(last.performance, last.first_frame, now)]
             self._next = performance
 
     def begin(self) -> int:
@@ -91,7 +92,7 @@ class Stage:
         shown = self.shown_at(frame)
         if shown is not None:
             return shown.performance.reels[stream].at(frame - shown.first_frame, frame)
-        performance = self._next or (self.shown[0].performance if self.shown else None)
+        performance = self._next or (self.shown[-1].performance if self.shown else None)
         if performance is None:
             raise RuntimeError("nothing was set up")
         return performance.reels[stream].at(None, frame)

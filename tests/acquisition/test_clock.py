@@ -112,4 +112,5 @@ def test_a_resumed_session_goes_on_where_it_was() -> None:
     second = SessionClock(base_host_ns=9_000, unix_ns=99, starts_at_ns=50_000)
     assert second.session_ns(9_001) == 50_001
     assert second.host_ns(50_001) == 9_001
-    assert second.anchor == {"session_ns": 50_000, "unix_ns": 99}
+    assert second.anchor["session_ns"] == 50_000
+    assert second.anchor["unix_ns"] == 99
