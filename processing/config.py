@@ -12,6 +12,7 @@ from processing.joint import JointConfig
 from processing.rig import RigSettings
 from processing.second_pass import CycleConfig
 from processing.segment.follow import BackgroundSettings
+from processing.segment.sighting import FindSettings
 from processing.segment.static_scene import SceneSettings
 from processing.track.frame_to_model import FrameToModelSettings
 from processing.track.register import RegisterConfig
@@ -26,6 +27,7 @@ class Config:
     scene: SceneSettings = field(default_factory=SceneSettings)
     rig: RigSettings = field(default_factory=RigSettings)
     masks: BackgroundSettings = field(default_factory=BackgroundSettings)
+    find: FindSettings = field(default_factory=FindSettings)
     given_masks: GivenMasks = DEFAULT_MASKS
     """Which of the session's masks are used: see processing.given_masks."""
     track: TrackConfig = field(default_factory=TrackConfig)

@@ -14,15 +14,19 @@ from numpy import ndarray as Array
 from processing.backends import make_segmenter, settings_of
 from processing.given_masks import chosen_masks
 from processing.rig import CAMERA, Rig, RobotOfSession, rig_stage
-from processing.segment.background import BackgroundSegmenter
+from processing.segment.background import NOT_FOUND, BackgroundSegmenter
+from processing.segment.candidates import Finder
 from processing.segment.robot_frames import RobotFrames
 from processing.segment.robot_view import RobotView
 from processing.segment.segmenter import Example
+from processing.segment.sighting import courses_of, look_of, read_sighting, sightings, write_sightings
 from processing.segment.static_scene import StaticScene, calibrated_table_depth, learn_scene, sample_positions
 from processing.stage import Counts, Done
+from recordings.errors import BadInput
 from recordings.records import RgbdFrame
 from recordings.results import write_masks
 from recordings.robot import panda
+from recordings.session import RgbdFrames
 
 if TYPE_CHECKING:
     from processing.pipeline import Run
@@ -30,12 +34,12 @@ if TYPE_CHECKING:
 
 def static_scene(run: Run) -> Done:
     """Stage `scene`: what the camera sees without the object, from frames of all tosses of the run."""
-    inputs = {name: run.keys[name] for name in ("calibration", *(f"toss_{t:02d}" for t in run.tosses))}
+    inputs = {name: run.keys[name] for name in ("calibration", *(f"toss_{t:02d}" for t in run.recorded))}
     return run.store.run("scene", 3, run.config.scene, inputs, lambda folder: _learn_scene(run, folder))
 
 
 def _learn_scene(run: Run, folder: Path) -> Counts:
-    streams = [run.session.toss(t).rgbd(CAMERA) for t in run.tosses]
+    streams = [run.session.toss(t).rgbd(CAMERA) for t in run.recorded]
     chosen = sample_positions([len(s) for s in streams], run.config.scene.frames)
     progress = run.progress("static scene")
 
@@ -44,7 +48,7 @@ def _learn_scene(run: Run, folder: Path) -> Counts:
             progress.step(done, len(chosen))
             yield streams[toss][position]
 
-    hidden = _hidden_by_robot(run, [(run.tosses[t], int(streams[t].times_ns[i])) for t, i in chosen])
+    hidden = _hidden_by_robot(run, [(run.recorded[t], int(streams[t].times_ns[i])) for t, i in chosen])
     table = calibrated_table_depth(run.session.calibration, CAMERA)
     scene = learn_scene(frames(), table, run.config.scene, hidden)
     scene.write(folder)
@@ -59,7 +63,7 @@ def _learn_scene(run: Run, folder: Path) -> Counts:
 def _hidden_by_robot(run: Run, at: Sequence[tuple[int, int]]) -> list[Bool[Array, "h w"]] | None:
     """Where the robot, or what it holds, may stand in front of the scene, at (toss, time); None without a robot."""
     robot = RobotOfSession(run.session)
-    if robot.missing(run.tosses) is not None:
+    if robot.missing(run.recorded) is not None:
         return None
     camera, settings = run.session.calibration.camera(CAMERA), run.config.scene
     view = RobotView(panda(), camera)
@@ -72,8 +76,11 @@ def object_masks(run: Run, toss: int, scene: Done) -> Done:
     rig = rig_stage(run, scene)
     inputs = {"scene": scene.key, "rig": rig.key, name: run.keys[name], "calibration": run.keys["calibration"]}
     choice = run.config.given_masks
-    given = chosen_masks(run.session.toss(toss).masks(), choice, toss == run.tosses[0])
+    given = _given(run, toss)
+    found_in = None if given else finding(run, scene, rig)
     shown = None if given or choice == "none" else _toss_with_mask(run)
+    if found_in is not None:
+        inputs["found"] = found_in.key
     if shown is not None:
         inputs["example"] = run.keys[f"toss_{shown:02d}"]
 
@@ -82,7 +89,10 @@ def object_masks(run: Run, toss: int, scene: Done) -> Done:
         learned = StaticScene.read(scene.folder)
         found_rig = Rig.read(rig.folder)
         drawn = _robot_frames(run, toss, found_rig)
-        background = BackgroundSegmenter(learned, run.session.calibration.camera(CAMERA), run.config.masks, drawn)
+        sighting = None if found_in is None else read_sighting(found_in.folder, toss)
+        if found_in is not None and sighting is None:
+            return _not_found(frames, folder, toss)
+        background = BackgroundSegmenter(learned, run.camera, run.config.masks, drawn, sighting)
         segmenter = make_segmenter(run.config.backends, background, run.device)
         robot = None if segmenter is background else drawn
         example = None if shown is None else _example(run, shown)
@@ -92,10 +102,15 @@ def object_masks(run: Run, toss: int, scene: Done) -> Done:
         if drawn is not None:
             drawn.write(folder / f"{name}.robot")
         empty = sum(not m.mask.any() for m in found)
+        least = run.config.track.view.least_samples
+        tracked = (m for m in found if m.mask.sum() >= least)
+        with_depth = any((frames[m.position].depth_m[m.mask] > 0).sum() >= least for m in tracked)
         return {
             "frames": len(found),
             "empty": empty,
+            "with_depth": with_depth,
             "given": len(given),
+            "found_at": None if sighting is None else sighting.start,
             "without_depth": len(frames.without_depth),
             **background.counts,
             "robot": rig.counts["robot"] if drawn is None else "drawn",
@@ -103,7 +118,55 @@ def object_masks(run: Run, toss: int, scene: Done) -> Done:
 
     named = settings_of(run.config.backends.segmenter, run.config.backends)
     config = {"given_masks": choice, "background": asdict(run.config.masks), **named}
-    return run.store.run("segment", 2, config, inputs, compute)
+    return run.store.run("segment", 3, config, inputs, compute)
+
+
+def _given(run: Run, toss: int) -> dict[int, Bool[Array, "h w"]]:
+    """The given masks of a toss that are used."""
+    return chosen_masks(run.session.toss(toss).masks(), run.config.given_masks, toss == run.recorded[0])
+
+
+def _not_found(frames: RgbdFrames, folder: Path, toss: int) -> Counts:
+    """A toss in which the object was not found: empty masks."""
+    first = frames[0].depth_m
+    write_masks(folder, toss, [np.zeros(first.shape, dtype=bool)] * len(frames), np.zeros(len(frames)))
+    return {"frames": len(frames), "empty": len(frames), "given": 0, "not_found": True}
+
+
+def finding(run: Run, scene: Done, rig: Done) -> Done:
+    """Stage `find`: where the object is in the tosses that come without a mask, told by all of them together.
+
+    Raises BadInput where it is found in none, and none came with a mask.
+    """
+    inputs = {"scene": scene.key, "rig": rig.key, "calibration": run.keys["calibration"]}
+    inputs |= {f"toss_{t:02d}": run.keys[f"toss_{t:02d}"] for t in run.recorded}
+    config = {"given_masks": run.config.given_masks, **asdict(run.config.find)}
+    return run.store.run("find", 1, config, inputs, lambda folder: _find(run, scene, rig, folder))
+
+
+def _find(run: Run, scene: Done, rig: Done, folder: Path) -> Counts:
+    finder = Finder(StaticScene.read(scene.folder), run.camera, run.config.find.things)
+    placed, world = Rig.read(rig.folder), run.session.calibration.find("world", CAMERA)
+    gravity = None if world is None else -world.rotation[2]
+    without = [t for t in run.tosses if not _given(run, t)]
+    courses = {}
+    for toss in without:
+        drawn = _robot_frames(run, toss, placed)
+        robot = None if drawn is None else drawn.coarser(finder.stride)
+        frames, progress = run.session.toss(toss).rgbd(CAMERA), run.progress(f"toss {toss}: looking for the object")
+        courses[toss] = courses_of(finder, frames, robot, gravity, run.config.find, progress.step)
+    shown = None if run.config.given_masks == "none" else _toss_with_mask(run)
+    known = None if shown is None else look_of(_example(run, shown), run.camera)
+    found = sightings(courses, known, finder.full_size, finder.stride, run.config.find)
+    if not found and len(without) == len(run.recorded):
+        raise BadInput(f"{run.session.path}: {NOT_FOUND}")
+    write_sightings(folder, found)
+    return {
+        "tosses": without,
+        "not_found": [t for t in without if t not in found],
+        "starts": {str(t): s.start for t, s in found.items()},
+        "scores": {str(t): round(s.score, 2) for t, s in found.items()},
+    }
 
 
 def _robot_frames(run: Run, toss: int, rig: Rig) -> RobotFrames | None:

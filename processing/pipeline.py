@@ -19,6 +19,7 @@ from processing.config import Config
 from processing.cycle import Pass, alone_start, run_cycle
 from processing.dynamics import rollout_stage
 from processing.frames import corrected_frames
+from processing.lost_tosses import with_lost, without_lost
 from processing.masks import object_masks, static_scene
 from processing.one_shape import of_one_shape
 from processing.segment.static_scene import StaticScene
@@ -70,6 +71,13 @@ class Run:
     keys: Mapping[str, str]
     starts: Mapping[int, StartPose] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    lost: tuple[int, ...] = ()
+    """Tosses in which the object is not seen: they show the scene and the robot only."""
+
+    @property
+    def recorded(self) -> tuple[int, ...]:
+        """All tosses of the run, with those in which the object is not seen."""
+        return tuple(sorted((*self.tosses, *self.lost)))
 
     @property
     def camera(self) -> CameraModel:
@@ -132,6 +140,7 @@ def process(run: Run, variant: Variant, scope: Scope) -> VariantRecord:
     """Tracks and shapes of one variant, and the record of where they are."""
     scene = static_scene(run)
     masks = {t: object_masks(run, t, scene) for t in run.tosses}
+    run = without_lost(run, masks)
     once = {t: first_pass(run, t, masks[t]) for t in run.tosses}  # p_i
     if variant.first == "one_toss":
         last = _alone(run, once, masks, scope)  # p_i, O_i
@@ -139,7 +148,7 @@ def process(run: Run, variant: Variant, scope: Scope) -> VariantRecord:
         first = _all_together(run, once, masks)  # P, O
         last = first if variant.refined is None else _refined_rows(run, variant, scope, once, first, masks)
         last = _with_apart(run, last, once, masks)
-    record = _record(run, variant, scope, last, masks)
+    record = _record(run, variant, scope, with_lost(run, last, masks), masks)
     with locked(run.store.results / ".variants.lock"):
         write_variant(run.store.results, record)
     return record
@@ -149,9 +158,10 @@ def process_with_model(run: Run, model: Path) -> VariantRecord:
     """Tosses tracked with a shape that was learned before (`--model`); nothing is learned anew."""
     scene, shape = static_scene(run), model_stage(run, model)
     masks = {t: object_masks(run, t, scene) for t in run.tosses}
+    run = without_lost(run, masks)
     tracks = {t: model_track_stage(run, t, masks[t], shape) for t in run.tosses}
     last = Pass(tracks, dict.fromkeys(run.tosses, shape), masks, shared_frame=True, notes=(f"shape: {model.name}",))
-    record = _record(run, WITH_MODEL, "all", last, masks)
+    record = _record(run, WITH_MODEL, "all", with_lost(run, last, masks), masks)
     with locked(run.store.results / ".variants.lock"):
         write_variant(run.store.results, record)
     return record
@@ -236,7 +246,7 @@ def _with_rollouts(run: Run, ended: Pass) -> Pass:
 
 def _record(run: Run, variant: Variant, scope: Scope, last: Pass, masks: Mapping[int, Done]) -> VariantRecord:
     tosses = [
-        TossRecord(t, last.tracks[t].name, last.shapes[t].name, last.masks.get(t, masks[t]).name) for t in run.tosses
+        TossRecord(t, last.tracks[t].name, last.shapes[t].name, last.masks.get(t, masks[t]).name) for t in run.recorded
     ]
     contact = {str(t): done.name for t, done in last.contact.items()}
     return VariantRecord(

@@ -119,7 +119,7 @@ class RobotOfSession:
 def rig_stage(run: Run, scene: Done) -> Done:
     """Stage `rig`, from frames of all tosses of the run and the static scene."""
     inputs = {"scene": scene.key, "calibration": run.keys["calibration"]}
-    inputs |= {f"toss_{t:02d}": run.keys[f"toss_{t:02d}"] for t in run.tosses}
+    inputs |= {f"toss_{t:02d}": run.keys[f"toss_{t:02d}"] for t in run.recorded}
     return run.store.run("rig", 1, run.config.rig, inputs, lambda folder: _check_rig(run, scene, folder))
 
 
@@ -127,7 +127,7 @@ def _check_rig(run: Run, scene: Done, folder: Path) -> Counts:
     learned = StaticScene.read(scene.folder)
     table = _table(run, learned)
     robot = RobotOfSession(run.session)
-    why_not = robot.missing(run.tosses)
+    why_not = robot.missing(run.recorded)
     fit = None if why_not else _fit(run, robot, learned, table)
     scale, sigma = _scale(fit, table)
     used = believed(scale, sigma, run.config.rig.scale)
@@ -153,8 +153,8 @@ def _table(run: Run, scene: StaticScene) -> TableScale | None:
 
 def _fit(run: Run, robot: RobotOfSession, scene: StaticScene, table: TableScale | None) -> RobotFit | None:
     assert robot.camera_from_base is not None
-    streams = [run.session.toss(t).rgbd(CAMERA) for t in run.tosses]
-    paths = [robot.path(t) for t in run.tosses]
+    streams = [run.session.toss(t).rgbd(CAMERA) for t in run.recorded]
+    paths = [robot.path(t) for t in run.recorded]
 
     def speed(toss: int, frame: int) -> float:
         path, at = paths[toss], int(streams[toss].times_ns[frame])

@@ -9,20 +9,20 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
-import cv2
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from numpy import ndarray as Array
 
-from processing.segment.follow import BackgroundSettings, Beside, Found, Memory, follow, remember
+from processing.segment.candidates import Finder
+from processing.segment.follow import BackgroundSettings, Beside, Found, Memory, component_in, follow, remember
 from processing.segment.foreground import moved_pixels, refine_border
-from processing.segment.likeness import Likeness
 from processing.segment.robot_frames import RobotFrames, robot_likeness, with_robot
 from processing.segment.segmenter import Example, FrameMask
+from processing.segment.sighting import FindSettings, Sighting, courses_of, look_of, sightings
 from processing.segment.static_scene import (
     StaticScene,
     colorless,
-    exposure_gain,
+    leveled,
     stereo_sigma_m,
     surroundings,
     with_object_removed,
@@ -32,6 +32,13 @@ from recordings.geometry import CameraModel
 from recordings.progress import Progress
 from recordings.records import RgbdFrame
 
+NOT_FOUND = (
+    "no mask of the object was given, and nothing in these frames moves in front of the static scene as a tossed "
+    "object does. Wanted: a mask of the first frame (mask_first.png in the folder layout, masks/ in BundleSDF's; for a "
+    "recorded session `toss-session export folder SESSION DIR`, draw DIR/toss_00/mask_first.png, `toss-session import "
+    "folder DIR OUT`, then `--masks first-toss`), or a recording in which the object moves in front of a camera that "
+    "stands still"
+)
 OBJECT_LIKE = 0.7
 """Log-odds of the object's colours against the robot's from which a pixel is not certainly the robot."""
 
@@ -47,12 +54,18 @@ class BackgroundSegmenter:
         camera: CameraModel | None,
         settings: BackgroundSettings,
         drawn: RobotFrames | None = None,
+        sighting: Sighting | None = None,
+        gravity: Float[Array, "3"] | None = None,
+        find: FindSettings | None = None,
     ) -> None:
-        """`drawn`: the robot in every frame of the toss, where it is known; it says more than its pixels alone."""
+        """`drawn`: the robot in every frame of the toss, where it is known; it says more than its pixels alone.
+        `sighting`: where the toss shows the object, used where no mask is given; without it the object is looked for
+        in the toss alone. `gravity`: its direction in the camera frame, where that is known."""
         self._scene = scene
         self._camera = camera
         self._settings = settings
         self._drawn = drawn
+        self._sighting, self._gravity, self._find_settings = sighting, gravity, find or FindSettings()
         self.counts = {"badly_exposed": 0, "others_moving": 0}
         """Frames whose colours say nothing, and frames in which something else of the object's size moves."""
 
@@ -64,40 +77,86 @@ class BackgroundSegmenter:
         robot: Sequence[Bool[Array, "h w"]] | None,
         progress: Progress,
     ) -> Iterator[FrameMask]:
-        """Yield a mask for every frame: the first known one, then those after it, then those before it."""
-        shape = frames[0].depth_m.shape
-        given = {i: _checked(m, i, shape) for i, m in given.items() if i < len(frames)}
-        start = min(given) if given else None
-        if start is None:
-            start, first = self._find(frames, example, robot)
+        """Yield a mask for every frame: the clearest known one, then those after it, then those before it; at last
+        those that the object came back in."""
+        given = {i: _checked(m, i, frames[0].depth_m.shape) for i, m in given.items() if i < len(frames)}
+        sighting = None if given else self._sighting or self._find(frames, example)
+        if sighting is None:
+            start = min(given)
+            seed = Found(given[start], 1.0)
+            self._refuse_scene(self._leveled(frames[start])[0], seed.mask, start)
         else:
-            first = given[start]
-            self._refuse_scene(self._leveled(frames[start])[0], first, start)
-        s, scene = self._settings, self._scene_without(self._leveled(frames[start])[0], first)
-        yield FrameMask(start, first, 1.0 if start in given else 0.8)
+            start = sighting.start
+            seed = self._outlined(frames[start], start, sighting.masks[start], robot)
+        yield FrameMask(start, seed.mask, seed.confidence)
+        mine = set(range(len(frames))) if sighting is None else sighting.belongs_to(start, len(frames))
+        empty = {i: FrameMask(i, np.zeros_like(seed.mask), 0.0) for i in range(len(frames)) if i not in mine}
         done = 1
+        for i, found, lit in self._both_ways(frames, start, seed, given, robot, mine - {start}):
+            self._count(found, lit)
+            done += 1
+            progress.step(done, len(frames), "masks")
+            mask = FrameMask(i, found.mask, found.confidence)
+            if found.mask.any() or sighting is None:
+                yield mask
+            else:
+                empty[i] = mask
+        for i in () if sighting is None else sighting.again:
+            for k, found in self._seen_again(frames, i, sighting, robot, set(empty)) if sighting else ():
+                del empty[k]
+                yield FrameMask(k, found.mask, found.confidence)
+        yield from empty.values()
+
+    def _both_ways(
+        self,
+        frames: Sequence[RgbdFrame],
+        start: int,
+        seed: Found,
+        given: Mapping[int, Bool[Array, "h w"]],
+        robot: Sequence[Bool[Array, "h w"]] | None,
+        within: set[int],
+    ) -> Iterator[tuple[int, Found, bool]]:
+        """Follow the object from a frame on, then from it back, as far as `within` reaches without a gap. Yields the
+        position, what was found, and whether the frame is well lit."""
+        first, s = self._leveled(frames[start])[0], self._settings
+        scene = self._scene_without(first, seed.mask)
         for order in (range(start + 1, len(frames)), range(start - 1, -1, -1)):
-            memory = remember(None, self._leveled(frames[start])[0], Found(first, 1.0))
+            memory = remember(None, first, seed)
+            if self._sighting is not None:
+                memory = replace(memory, likeness=memory.likeness.with_shares(self._sighting.shares))
             for i in order:
+                if i not in within:
+                    break
                 block = None if robot is None else robot[i]
                 frame, lit = self._leveled(frames[i])
                 found = Found(given[i], 1.0) if i in given else self._followed(frame, i, scene, memory, block, lit)
                 memory = remember(memory, frame, found, learn=lit and found.confidence > s.sure)
-                self._count(found, lit)
-                done += 1
-                progress.step(done, len(frames), "masks")
-                yield FrameMask(i, found.mask, found.confidence)
+                yield i, found, lit
+
+    def _seen_again(
+        self,
+        frames: Sequence[RgbdFrame],
+        start: int,
+        sighting: Sighting,
+        robot: Sequence[Bool[Array, "h w"]] | None,
+        empty: set[int],
+    ) -> Iterator[tuple[int, Found]]:
+        """The object where it is seen in frames in which following did not find it."""
+        if start not in empty:
+            return
+        seed = self._outlined(frames[start], start, sighting.masks[start], robot)
+        if not seed.mask.any():
+            return
+        empty = empty & sighting.belongs_to(start, len(frames))
+        yield start, seed
+        for i, found, _ in self._both_ways(frames, start, seed, {}, robot, empty - {start}):
+            if found.mask.any():
+                yield i, found
 
     def _leveled(self, frame: RgbdFrame) -> tuple[RgbdFrame, bool]:
         """The frame as bright as the scene, and whether its colours can be believed at all."""
-        gain, clipped = exposure_gain(frame, self._scene)
         s = self._settings
-        if not (s.darkest < gain < 1 / s.darkest and clipped < s.most_clipped):
-            return frame, False
-        if abs(gain - 1) < s.least_gain:
-            return frame, True
-        table = np.clip(np.arange(256) / gain, 0, 255).round().astype(np.uint8)
-        return replace(frame, color_rgb=table[frame.color_rgb]), True
+        return leveled(frame, self._scene, s.darkest, s.most_clipped, s.least_gain)
 
     def _count(self, found: Found, lit: bool) -> None:
         self.counts["badly_exposed"] += int(not lit)
@@ -148,27 +207,41 @@ class BackgroundSegmenter:
             return self._scene
         return with_object_removed(self._scene, frame, mask, moved, self._camera)
 
-    def _find(
-        self, frames: Sequence[RgbdFrame], example: Example | None, robot: Sequence[Bool[Array, "h w"]] | None
-    ) -> tuple[int, Bool[Array, "h w"]]:
-        """The first frame in which something stands out from the scene, and its mask."""
-        known = None if example is None else Likeness.of(example.frame.color_rgb, example.mask)
-        for i in range(len(frames)):
-            frame, lit = self._leveled(frames[i])
-            block = None if robot is None else robot[i]
-            scene = self._scene if lit else colorless(self._scene)
-            seen = None if self._drawn is None else self._drawn.seen(frame, i)
-            if self._drawn is not None and seen is not None:
-                scene = with_robot(scene, frame, seen, self._drawn.settings)
-                block = seen.certain if block is None else seen.certain | block
-            rough = _best_candidate(frame, scene, known if lit else None, block, self._settings)
-            if rough is not None:
-                return i, refine_border(frame, scene, rough, None, self._settings.foreground)[0]
-        raise BadInput(
-            "no mask of the object was given, and in no frame does anything stand out from the static scene. "
-            "Wanted: a mask of the first frame (mask_first.png in the folder layout, masks/ in BundleSDF's), "
-            "or a recording in which the object moves in front of a camera that stands still"
-        )
+    def _outlined(
+        self,
+        frame: RgbdFrame,
+        position: int,
+        rough: Bool[Array, "h w"],
+        robot: Sequence[Bool[Array, "h w"]] | None,
+    ) -> Found:
+        """What was found roughly, with its border drawn; as it is where nothing stands out there."""
+        s, (frame, lit) = self._settings, self._leveled(frame)
+        scene = self._scene if lit else colorless(self._scene)
+        block = None if robot is None else robot[position]
+        seen = None if self._drawn is None else self._drawn.seen(frame, position)
+        if self._drawn is not None and seen is not None:
+            scene = with_robot(scene, frame, seen, self._drawn.settings)
+            block = seen.certain if block is None else seen.certain | block
+        moved = moved_pixels(frame, scene, s.foreground)
+        if block is not None:
+            moved &= ~block
+        mask, sure = refine_border(frame, scene, component_in(moved, rough), None, s.foreground)
+        return Found(mask, sure)
+
+    def _find(self, frames: Sequence[RgbdFrame], example: Example | None) -> Sighting:
+        """The object in this toss alone."""
+        if self._camera is None:
+            raise BadInput("no mask of the object was given, and the camera's intrinsics are not known")
+        finder = Finder(self._scene, self._camera, self._find_settings.things)
+        drawn = None if self._drawn is None else self._drawn.coarser(finder.stride)
+        courses = courses_of(finder, frames, drawn, self._gravity, self._find_settings)
+        known = None if example is None else look_of(example, self._camera)
+        shape = frames[0].depth_m.shape
+        found = sightings({0: courses}, known, shape, finder.stride, self._find_settings)
+        if not found:
+            raise BadInput(NOT_FOUND)
+        self._sighting = found[0]
+        return found[0]
 
 
 def _checked(mask: Bool[Array, "h w"], position: int, shape: tuple[int, ...]) -> Bool[Array, "h w"]:
@@ -179,34 +252,3 @@ def _checked(mask: Bool[Array, "h w"], position: int, shape: tuple[int, ...]) ->
     if not mask.any():
         raise BadInput(f"the given mask of frame {position} is empty; wanted the object's pixels, or no mask at all")
     return mask
-
-
-def _best_candidate(
-    frame: RgbdFrame,
-    scene: StaticScene,
-    known: Likeness | None,
-    block: Bool[Array, "h w"] | None,
-    s: BackgroundSettings,
-) -> Bool[Array, "h w"] | None:
-    """The component most likely to be the object: large, of known colours, in view as a whole, above the table."""
-    moved = moved_pixels(frame, scene, s.foreground)
-    if block is not None:
-        moved &= ~block
-    if scene.table_depth_m.any():
-        below = (scene.table_depth_m > 0) & (frame.depth_m > scene.table_depth_m + s.foreground.nearer_m)
-        moved &= ~below
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(moved.astype(np.uint8), connectivity=4)
-    best, best_score = None, 0.0
-    odds = None if known is None else known.log_odds(frame.color_rgb)
-    height, width = moved.shape
-    for k in range(1, count):
-        left, top, w, h, area = stats[k]
-        mask = labels == k
-        if area < s.least_px or (frame.depth_m[mask] > 0).mean() < 0.3:
-            continue
-        cut = left == 0 or top == 0 or left + w == width or top + h == height
-        alike = 1.0 if odds is None else float(np.exp(odds[mask].mean()))
-        score = float(area) * alike * (0.2 if cut else 1.0)
-        if score > best_score:
-            best, best_score = mask, score
-    return best

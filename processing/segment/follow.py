@@ -132,7 +132,7 @@ def follow(
     moved &= scene.known | nearer_than_scene(frame.depth_m, scene, s.foreground) | (likeness > 0)
     if block is not None:
         moved &= ~block
-    rough = _component_in(moved, near)
+    rough = component_in(moved, near)
     if beside is not None:
         rough |= _other_pieces(frame, moved & ~rough, expected, beside, memory, s)
     others = moved & near & ~(cv2.dilate(rough.astype(np.uint8), kernel(3)) > 0)
@@ -149,7 +149,8 @@ def follow(
         mask, sure = rough, 0.6
     else:
         least = None if beside is None else s.piece_px
-        odds = None if beside is None else beside.odds
+        # where the scene's colour is known, it tells; the robot's colours speak against the object only
+        odds = None if beside is None else np.where(scene.known, np.minimum(beside.odds, 0), beside.odds)
         mask, sure = refine_border(frame, scene, rough, odds, s.foreground, least)
     if block is not None:
         mask = mask & ~block
@@ -170,7 +171,7 @@ def _shifted(mask: Bool[Array, "h w"], by_px: Float[Array, "2"]) -> Bool[Array, 
     return cv2.warpAffine(mask.astype(np.uint8), moved, mask.shape[::-1], flags=cv2.INTER_NEAREST) > 0
 
 
-def _component_in(mask: Bool[Array, "h w"], region: Bool[Array, "h w"]) -> Bool[Array, "h w"]:
+def component_in(mask: Bool[Array, "h w"], region: Bool[Array, "h w"]) -> Bool[Array, "h w"]:
     """The component that has most pixels in a region."""
     count, labels = cv2.connectedComponents(mask.astype(np.uint8), connectivity=4)
     inside = np.bincount(labels[region], minlength=count)
@@ -257,4 +258,4 @@ def _among_others(
     belief = smooth(odds, frame.color_rgb[at].astype(np.float32), s.foreground)
     out = np.zeros_like(expected)
     out[at] = cv2.morphologyEx((belief > 0).astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)) > 0
-    return fill_holes(_component_in(out, expected))
+    return fill_holes(component_in(out, expected))

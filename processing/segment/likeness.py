@@ -41,6 +41,10 @@ class Likeness:
             around=MEMORY * self.around + (1 - MEMORY) * around,
         )
 
+    def with_shares(self, shares: Float[Array, " b"]) -> Likeness:
+        """With the colours that the object shows elsewhere: it has more sides than one."""
+        return replace(self, first=0.5 * (self.first + shares), recent=0.5 * (self.recent + shares))
+
     @property
     def object_shares(self) -> Float[Array, " b"]:
         """How often each colour is seen on the object."""

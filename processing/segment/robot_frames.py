@@ -57,6 +57,21 @@ class RobotSeen:
     certain: Bool[Array, "h w"]
 
 
+class CoarseFrames(Sequence[RgbdFrame]):
+    """Frames of which only every stride-th pixel of rows and columns is seen."""
+
+    def __init__(self, frames: Sequence[RgbdFrame], stride: int) -> None:
+        self._frames, self._stride = frames, stride
+
+    def __len__(self) -> int:
+        return len(self._frames)
+
+    def __getitem__(self, position: Any) -> Any:
+        frame, s = self._frames[position], self._stride
+        color = np.ascontiguousarray(frame.color_rgb[::s, ::s])
+        return replace(frame, color_rgb=color, depth_m=np.ascontiguousarray(frame.depth_m[::s, ::s]))
+
+
 class RobotFrames(Sequence[Bool[Array, "h w"]]):
     """The robot in each frame of one toss, drawn when asked for. As a sequence: its `certain` pixels."""
 
@@ -71,6 +86,7 @@ class RobotFrames(Sequence[Bool[Array, "h w"]]):
         settings: RobotSettings | None = None,
     ) -> None:
         self._frames, self._view, self._path = frames, view, path
+        self._placed = camera_from_base, delay_s, depth_scale
         self._base = camera_from_base @ Transform.identity(camera_from_base.source, path.robot.root)
         self._delay_ns = int(delay_s * 1e9)
         self._scale = depth_scale
@@ -94,6 +110,11 @@ class RobotFrames(Sequence[Bool[Array, "h w"]]):
             if (drawn := self._last[1]) is not None:
                 self._kept[position] = np.packbits(drawn.certain)
         return self._last[1]
+
+    def coarser(self, stride: int) -> RobotFrames:
+        """The same robot for frames of which only every stride-th pixel of rows and columns is looked at."""
+        frames = CoarseFrames(self._frames, stride)
+        return RobotFrames(frames, self._view.coarser(stride), self._path, *self._placed, self.settings)
 
     def write(self, folder: Path) -> None:
         """The `certain` pixels of every frame that was looked at, as PNG by position (0 or 255), for the viewer."""

@@ -307,6 +307,23 @@ def exposure_gain(frame: RgbdFrame, scene: StaticScene) -> tuple[float, float]:
     return float(np.median(ratio)), float(clipped.mean())
 
 
+def leveled(
+    frame: RgbdFrame, scene: StaticScene, darkest: float = 0.12, most_clipped: float = 0.5, least_gain: float = 0.02
+) -> tuple[RgbdFrame, bool]:
+    """The frame as bright as the scene, and whether its colours can be believed at all.
+
+    They cannot in a frame `darkest` times as bright as the scene, in one brighter by the inverse, and where more than
+    `most_clipped` of the scene is overexposed. A gain within `least_gain` of 1 is left as it is.
+    """
+    gain, clipped = exposure_gain(frame, scene)
+    if not (darkest < gain < 1 / darkest and clipped < most_clipped):
+        return frame, False
+    if abs(gain - 1) < least_gain:
+        return frame, True
+    table = np.clip(np.arange(256) / gain, 0, 255).round().astype(np.uint8)
+    return replace(frame, color_rgb=table[frame.color_rgb]), True
+
+
 def colorless(scene: StaticScene) -> StaticScene:
     """The scene for a frame whose colours say nothing: only its depth is known."""
     return replace(scene, color_sigma=np.full_like(scene.color_sigma, 1e4))

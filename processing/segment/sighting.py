@@ -1,0 +1,156 @@
+"""Where a toss shows the object most clearly, and the same for every toss of a session, without any given mask."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float
+from numpy import ndarray as Array
+
+from processing.segment.candidates import Candidate, CandidateSettings, Finder
+from processing.segment.courses import Course, CourseSettings, Look, alike, choose, join
+from processing.segment.likeness import color_shares
+from processing.segment.robot_frames import CoarseFrames, RobotFrames
+from processing.segment.segmenter import Example
+from recordings.geometry import CameraModel
+from recordings.records import RgbdFrame
+
+
+@dataclass(frozen=True)
+class FindSettings:
+    """How the object is found where no mask of it was given."""
+
+    things: CandidateSettings = field(default_factory=CandidateSettings)
+    courses: CourseSettings = field(default_factory=CourseSettings)
+    every_s: float = 0.06
+    """Frames are looked at so far apart, and at each toss's first and last."""
+    again: float = 0.3
+    """Another course looks so much like the object (-1..1) that it is the object, seen before or after a gap."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sighting:
+    """The object in one toss: rough masks (blocks of some pixels) by position of the frame. `start` is the clearest;
+    the others are places where it is seen again after it was away. `spans`: the first and the last frame of the course
+    that each belongs to. `shares`: of its colours, over all tosses."""
+
+    start: int
+    masks: Mapping[int, Bool[Array, "h w"]]
+    spans: Mapping[int, tuple[int, int]]
+    shares: Float[Array, " n"]
+    score: float
+
+    @property
+    def again(self) -> list[int]:
+        """The other frames, in time order."""
+        return [i for i in sorted(self.masks) if i != self.start]
+
+    def belongs_to(self, start: int, count: int) -> set[int]:
+        """The frames, of so many, that no other course than that of `start` covers."""
+        others = [span for i, span in self.spans.items() if i != start]
+        return set(range(count)) - {i for first, last in others for i in range(first, last + 1)}
+
+
+def courses_of(
+    finder: Finder,
+    frames: Sequence[RgbdFrame],
+    robot: RobotFrames | None,
+    gravity: Float[Array, "3"] | None,
+    settings: FindSettings,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> list[Course]:
+    """Everything that moves through a toss. `robot`: drawn for coarse frames."""
+    coarse = CoarseFrames(frames, finder.stride)
+    looked_at = positions(frames, settings.every_s)
+    things = []
+    for done, i in enumerate(looked_at):
+        progress(done, len(looked_at))
+        things.append(finder.things(coarse[i], i, robot))
+    return join(things, gravity, settings.courses)
+
+
+def positions(frames: Sequence[RgbdFrame], every_s: float) -> list[int]:
+    """Positions of frames about so far apart, with the first and the last one."""
+    if len(frames) < 2:
+        return list(range(len(frames)))
+    period_s = (frames[len(frames) - 1].time_ns - frames[0].time_ns) * 1e-9 / (len(frames) - 1)
+    step = max(1, int(every_s / period_s + 0.2)) if period_s > 0 else 1
+    return sorted({*range(0, len(frames), step), len(frames) - 1})
+
+
+def sightings(
+    courses: Mapping[int, Sequence[Course]], known: Look | None, shape: tuple[int, ...], stride: int, s: FindSettings
+) -> dict[int, Sighting]:
+    """The object in every toss in which it is found. `known`: what it looks like, where a mask of it was given."""
+    chosen = choose(courses, known, s.courses)
+    if not chosen:
+        return {}
+    shares = np.asarray(np.mean([c.shares for c, _ in chosen.values()], axis=0))
+    look = Look(shares if known is None else known.shares, float(np.median([c.size_m for c, _ in chosen.values()])))
+    found = {}
+    for toss, (course, score) in chosen.items():
+        first = clearest(course)
+        others = [c for c in courses[toss] if c is not course and apart(c, course) and alike(c, look) > s.again]
+        seen = {clearest(c).position: c for c in others} | {first.position: course}
+        masks = {i: clearest(c).picture(shape, stride) for i, c in seen.items()}
+        spans = {i: (c.seen[0].position, c.seen[-1].position) for i, c in seen.items()}
+        found[toss] = Sighting(first.position, masks, spans, look.shares, score)
+    return found
+
+
+def look_of(example: Example, camera: CameraModel) -> Look:
+    """What a frame with a given mask tells of the object."""
+    depth = example.frame.depth_m[example.mask & (example.frame.depth_m > 0)]
+    middle = float(np.median(depth)) if len(depth) else 1.0
+    size = float(np.sqrt(example.mask.sum())) * middle / float(camera.fx)
+    return Look(color_shares(example.frame.color_rgb, example.mask), size)
+
+
+def apart(a: Course, b: Course) -> bool:
+    """Whether two courses share no time."""
+    return a.seen[-1].position < b.seen[0].position or b.seen[-1].position < a.seen[0].position
+
+
+def clearest(course: Course) -> Candidate:
+    """The frame in which the object stands most freely, as large as elsewhere, and hardly moves in the picture."""
+    sizes = np.array([c.size_m for c in course.seen])
+    usual = float(np.quantile(sizes, 0.6))
+    areas = np.array([c.area_px for c in course.seen], dtype=float)
+    places = np.array([c.center_m for c in course.seen])
+    step = np.linalg.norm(np.gradient(places, axis=0), axis=1) if len(places) > 1 else np.zeros(len(places))
+    whole = np.exp(-2 * np.abs(np.log(np.maximum(sizes, 1e-6) / usual)))
+    free = np.array([c.free for c in course.seen])
+    score = free * whole * (0.5 + 0.5 * areas / areas.max()) / (1 + step / 0.05)
+    return course.seen[int(score.argmax())]
+
+
+def write_sightings(folder: Path, found: Mapping[int, Sighting]) -> None:
+    """Into a stage's folder: sightings.json, and the rough masks as toss_XX/<position>.png (0 or 255)."""
+    document: dict[str, Any] = {}
+    for toss, sighting in found.items():
+        spans = {str(i): list(span) for i, span in sighting.spans.items()}
+        document[str(toss)] = {"start": sighting.start, "score": round(sighting.score, 3), "spans": spans}
+        (folder / f"toss_{toss:02d}").mkdir()
+        for position, mask in sighting.masks.items():
+            cv2.imwrite(str(folder / f"toss_{toss:02d}" / f"{position:06d}.png"), mask.astype(np.uint8) * 255)
+    (folder / "sightings.json").write_text(json.dumps(document, indent=1) + "\n")
+    if found:
+        np.save(folder / "shares.npy", next(iter(found.values())).shares)
+
+
+def read_sighting(folder: Path, toss: int) -> Sighting | None:
+    """One toss's, from a stage's folder; None where the object was not found in it."""
+    told = json.loads((folder / "sightings.json").read_text()).get(str(toss))
+    if told is None:
+        return None
+    files = sorted((folder / f"toss_{toss:02d}").glob("*.png"))
+    masks = {int(f.stem): np.asarray(np.asarray(cv2.imread(str(f), cv2.IMREAD_GRAYSCALE)) > 0) for f in files}
+    shares = np.load(folder / "shares.npy", allow_pickle=False)
+    spans = {int(i): (int(first), int(last)) for i, (first, last) in told["spans"].items()}
+    return Sighting(int(told["start"]), masks, spans, shares, float(told["score"]))
