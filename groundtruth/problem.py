@@ -158,14 +158,14 @@ class _Collector:
         tag_id = _remapped(config, sighting.tag_id, camera, stamp_ns)
         body = self.owner.get(tag_id) or _adopt(config, tag_id, self.tags, self.owner)
         area = _area_px2(sighting.corners_px)
-        if body is None or tag_id in seen or 2 * area < config.minimum_tag_area_px2:
+        if body is None or tag_id in seen:
             return None
         tag, rig = self.tags[tag_id], config.body(camera.rig)
         return Observation(stamp_ns, number, rig, body, tag, sighting.corners_px, *NOT_YET, area)
 
     def observed(self) -> tuple[Observation, ...]:
-        """All observations with their planar solutions. What is seen too flat has none to start from; its corners still
-        count."""
+        """All observations with their planar solutions. What is seen too flat or too small has none to start from; its
+        corners still count (TagSLAM sets small tags aside, and takes them up once the poses round them are there)."""
         flat = np.radians(self.config.minimum_viewing_deg)
         out = list(self.observations)
         for number, camera in enumerate(self.config.cameras):
@@ -173,7 +173,8 @@ class _Collector:
             sizes = np.array([out[i].tag.size_m for i in mine])
             corners = np.array([out[i].corners_px for i in mine]).reshape(-1, 4, 2)
             for i, (poses, errors) in zip(mine, planar_poses(camera.model, sizes, corners), strict=True):
-                keep = len(poses) if len(poses) and _view_angle_rad(poses[0]) >= flat else 0
+                small = 2 * out[i].area_px2 < self.config.minimum_tag_area_px2
+                keep = len(poses) if len(poses) and not small and _view_angle_rad(poses[0]) >= flat else 0
                 out[i] = replace(out[i], candidates=poses[:keep], errors_px=errors[:keep])
         return tuple(out)
 
