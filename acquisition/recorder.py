@@ -210,6 +210,15 @@ class Recorder:
 
     # what the pumps call
 
+    def take_capture(self, entry: DeviceEntry, capture: RgbdCapture) -> None:
+        """Colour and depth come together when the later one is there: its stamps are what the receipt follows."""
+        images = capture.images()
+        latest = max(images, key=lambda image: image.mid_exposure_ns, default=None)
+        if latest is not None:
+            self._leads.setdefault((entry.name, latest.stamp.clock), _topic(entry, latest.stream))
+        for image in images:
+            self.take_image(entry, image, capture.unit_m if image.stream == "depth" else None)
+
     def take_image(self, entry: DeviceEntry, image: Image, unit_m: float | None = None) -> None:
         topic = _topic(entry, image.stream)
         gate = self._gates[topic]
@@ -397,8 +406,7 @@ class _Pump(threading.Thread):
         if entry.kind == "rgbd" and isinstance(device, RgbdCamera):
             capture = device.read(READ_S)
             if isinstance(capture, RgbdCapture):
-                for image in capture.images():
-                    recorder.take_image(entry, image, capture.unit_m if image.stream == "depth" else None)
+                recorder.take_capture(entry, capture)
         elif entry.kind == "mono" and isinstance(device, MonoCamera):
             picture = device.read(READ_S)
             if picture is not None:

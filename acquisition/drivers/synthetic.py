@@ -76,6 +76,7 @@ class SyntheticConfig:
     pictures: Literal["rendered", "pool"] = "rendered"
     """`pool`: a few noisy pictures again and again, for rates that no renderer reaches here."""
     color_size: tuple[int, int] = (424, 240)
+    color_focal_px: float = 430.0
     mono_size: tuple[int, int] = (480, 360)
     mono_cameras: int = 3
     fps: float = 30.0

@@ -81,7 +81,9 @@ def scene_config(config: SyntheticConfig) -> SceneConfig:
             hold_s=0.12,
             rest_s=0.5,
         ),
-        camera=CameraConfig(width=width, height=height, focal_px=430.0, distance_m=0.95, fps=config.fps),
+        camera=CameraConfig(
+            width=width, height=height, focal_px=config.color_focal_px, distance_m=0.95, fps=config.fps
+        ),
         color=ColorConfig(subframes=config.subframes, exposure_s=0.004),
         depth=DepthConfig(delay_s=config.depth_delay_ms * 1e-3),
         mono=MonoConfig(width=mono_width, height=mono_height, subframes=config.subframes),
