@@ -53,6 +53,8 @@ class Stage:
     """Accept only errors this many times smaller."""
     agreeing: float = 0.5
     """Share of the observations that must agree with a proposal."""
+    drifted: bool = False
+    """Only where there is odometry: it drifts, so that a tag's early and late sightings disagree until it is placed."""
     at_rest: bool = False
     """Place a body with fake odometry where it was one stamp away."""
 
@@ -62,6 +64,7 @@ STAGES = (
     Stage(),
     Stage(ambiguous_too=True),
     Stage(ambiguous_too=True, agreeing=0.2),
+    Stage(ambiguous_too=True, agreeing=0.05, drifted=True),
     Stage(ambiguous_too=True, at_rest=True),
 )
 

@@ -136,7 +136,7 @@ def grow(problem: Problem, growth: Growth, settings: TagSlamSettings, progress: 
     """Sweep until nothing more can be placed, bolder from stage to stage. What there is is solved in between."""
     solved_at, fixed_at = 0, growth.fixed()
     for stage in STAGES:
-        while True:
+        while not stage.drifted or problem.odometry:
             placed = growth.sweep(stage)
             placed += _carry_odometry(problem, growth)
             placed += _carry_rest(problem, growth) if stage.at_rest and not placed else 0
