@@ -9,13 +9,13 @@ import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
+from acquisition.drivers import usb
 from acquisition.preflight import Preflight, Row
 from acquisition.streams import READS
 from recordings.errors import DeviceNotFound
 
 USBFS = Path("/sys/module/usbcore/parameters/usbfs_memory_mb")
 USBFS_MB = 1000
-UDEV = Path("/etc/udev/rules.d")
 SLOWEST_MB_S = 60.0
 
 
@@ -54,9 +54,8 @@ def realsense() -> Iterator[Row]:
     if not found:
         fix = "plug it into USB 3; `lsusb -d 8086:` shows whether the kernel sees it"
         yield Row("camera", "realsense", "warning", "none found", fix)
-    if not list(UDEV.glob("*realsense*")) and os.geteuid() != 0:
-        rules = "sudo cp 99-realsense-libusb.rules /etc/udev/rules.d/ && sudo udevadm control --reload-rules"
-        yield Row("permission", "realsense", "warning", "no udev rule: only root may open the camera", rules)
+    for camera in usb.forbidden(usb.INTEL):
+        yield Row("permission", "realsense", "fail", str(camera), camera.fix)
 
 
 def genicam() -> Iterator[Row]:
@@ -71,6 +70,8 @@ def genicam() -> Iterator[Row]:
         return
     for line in lines:
         yield Row("camera", "genicam", "ok", line)
+    for camera in usb.forbidden(usb.GREY_CAMERAS):
+        yield Row("permission", "genicam", "fail", str(camera), camera.fix)
     if not lines:
         fix = "camera and computer in one network (GigE), or USB3 with a udev rule for its vendor"
         yield Row("camera", "genicam", "warning", "none found", fix)

@@ -21,6 +21,7 @@ from jaxtyping import UInt8
 from numpy import ndarray as Array
 
 from acquisition.devices import DeviceLost, DeviceRefused, Health, Image, Stamp
+from acquisition.drivers import usb
 from acquisition.drivers.aravis import STATUS, Aravis, AravisError, Found
 from acquisition.drivers.genicam_setup import GenicamSettings, apply
 from acquisition.drivers.inbox import Inbox
@@ -182,7 +183,8 @@ class GenicamCamera:
         if fits:
             raise DeviceNotFound(f"{self.name}: found {seen}; wanted one: name its `serial` in the rig")
         raise DeviceNotFound(
-            f"{self.name}: found {seen}; wanted {wanted or 'a camera'}; check the cable and the serial in the rig"
+            f"{self.name}: found {seen}; wanted {wanted or 'a camera'}{usb.hint(usb.GREY_CAMERAS)}; check the cable "
+            "and the serial in the rig"
         )
 
 

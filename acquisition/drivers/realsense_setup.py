@@ -9,6 +9,7 @@ from typing import Any
 
 from acquisition.devices import DeviceRefused
 from acquisition.drivers import realsense_parts as parts
+from acquisition.drivers import usb
 from recordings.errors import BadInput, DeviceNotFound
 
 ROLLING = {"D415": "colour and depth", "D435": "colour", "D405": "colour and depth", "D410": "depth"}
@@ -53,8 +54,8 @@ def find_serial(rs: Any, context: Any, name: str, serial: str | None) -> str:
     if serial is None or serial not in found:
         wanted = f"serial {serial}" if serial else "a camera"
         raise DeviceNotFound(
-            f"{name}: found {seen}; wanted {wanted}; check the cable (USB 3) and, where the camera is plugged in, the "
-            "udev rules of librealsense"
+            f"{name}: found {seen}; wanted {wanted}{usb.hint(usb.INTEL)}; check the cable (USB 3) and `serial` in the "
+            "rig: `toss-record --doctor` lists what is there"
         )
     return serial
 
