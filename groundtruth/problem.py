@@ -179,6 +179,15 @@ class _Collector:
         return tuple(out)
 
 
+def unambiguous(config: TagSlamConfig, o: Observation) -> bool:
+    """Whether TagSLAM would start a pose from this sighting: seen from the front, or one solution is clearly better."""
+    if len(o.candidates) == 0:
+        return False
+    if len(o.errors_px) < 2 or _view_angle_rad(o.candidates[0]) >= np.radians(config.ambiguous_deg):
+        return True
+    return bool(o.errors_px[0] ** 2 <= config.most_ambiguous * o.errors_px[1] ** 2)
+
+
 NOT_YET = (np.zeros((0, 4, 4)), np.zeros(0))
 
 

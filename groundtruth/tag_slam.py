@@ -23,6 +23,7 @@ from groundtruth.problem import (
     camera_key,
     make_problem,
     tag_key,
+    unambiguous,
 )
 from groundtruth.tagslam_config import DEFAULT_WIGGLE, BodyEntry, TagSlamConfig
 from recordings.progress import Progress, Silent
@@ -324,15 +325,25 @@ def _add_measurements(problem: Problem, graph: Graph, index: Mapping[Key, int]) 
             )
 
 
+def _certain(problem: Problem) -> set[Key]:
+    """Moving poses that some unambiguous sighting shows. TagSLAM answers no others, unless odometry carries them."""
+    return {
+        key for o in problem.observations if unambiguous(problem.config, o) for key in (o.rig_key, o.body_key) if key[2]
+    }
+
+
 def _result(problem: Problem, growth: Growth, index: Mapping[Key, int], solution: Solution) -> TagSlamResult:
     poses = {key: solution.poses[number] for key, number in index.items()}
     bodies, static = {}, {}
+    certain = _certain(problem)
     for body in problem.config.bodies:
         if body.is_static:
             if body_key(body, 0) in poses:
                 static[body.name] = poses[body_key(body, 0)]
             continue
-        stamps = tuple(s for s in problem.stamps if body_key(body, s) in poses)
+        carried = body.name in problem.odometry or body.fake_odom_noise is not None
+        answered = poses.keys() if carried else poses.keys() & certain
+        stamps = tuple(s for s in problem.stamps if body_key(body, s) in answered)
         stack = np.stack([poses[body_key(body, s)] for s in stamps]) if stamps else np.zeros((0, 4, 4))
         bodies[body.name] = (stamps, stack)
     return TagSlamResult(

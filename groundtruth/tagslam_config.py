@@ -105,6 +105,10 @@ class TagSlamConfig:
     amnesia: bool = False
     minimum_tag_area_px2: float = 0.0
     minimum_viewing_deg: float = 20.0
+    ambiguous_deg: float = 60.0
+    """Tags seen flatter than this must have one planar solution that is clearly better:"""
+    most_ambiguous: float = 0.3
+    """its squared error at most this share of the other's."""
 
     def body(self, name: str) -> BodyEntry:
         for body in self.bodies:
@@ -144,6 +148,8 @@ def _config(cameras: Mapping[str, Any], poses: Mapping[str, Any], main: Mapping[
         amnesia=bool(main.get("amnesia", False)),
         minimum_tag_area_px2=float(parameters.get("minimum_tag_area", 0)),
         minimum_viewing_deg=float(parameters.get("minimum_viewing_angle", 20.0)),
+        ambiguous_deg=float(parameters.get("ambiguity_angle_threshold", 60.0)),
+        most_ambiguous=float(parameters.get("max_ambiguity_ratio", 0.3)),
     )
 
 
