@@ -79,9 +79,11 @@ def _work_tagslam(args: argparse.Namespace) -> Outcome:
             "(a session named tagslam is written ./tagslam)"
         )
     started = time.process_time()
-    result = run_tag_slam(read_config(args.folder), read_recording(args.folder), progress=progress_for("toss-truth"))
-    document = {**answer_document(result), "cpu_s": round(time.process_time() - started, 2)}
-    text = answer_text(document)
+    config = read_config(args.folder)
+    result = run_tag_slam(config, read_recording(args.folder), progress=progress_for("toss-truth"))
+    cpu_s = round(time.process_time() - started, 2)
+    document = {**answer_document(result), "notes": list(config.notes), "cpu_s": cpu_s}
+    text = "\n".join([answer_text(document), *(f"note: {n}" for n in config.notes)])
     if args.out is not None:
         args.out.parent.mkdir(parents=True, exist_ok=True)
         write_bytes(args.out, json_text(document).encode())

@@ -52,6 +52,9 @@ def read_recording(folder: Path) -> Recording:
     for name in ("tag_detections.bag", "tag_detections.bag.bz2"):
         if (folder / name).exists():
             return _read_bag(folder / name)
+    packed = Path(f"{(folder / 'tag_detections.bag').resolve()}.bz2")  # a link to another test's bag, packed there
+    if packed.exists():
+        return _read_bag(packed)
     raise BadInput(f"{folder} holds no detections; wanted detections.npz, tag_detections.bag or tag_detections.bag.bz2")
 
 

@@ -229,7 +229,7 @@ def _adopt(
 
 
 def _remapped(config: TagSlamConfig, tag_id: int, camera: CameraEntry, stamp_ns: int) -> int:
-    for remap in config.remaps:
+    for remap in reversed(config.remaps):
         named = remap.camera is None or remap.camera == camera.name
         if remap.tag_id == tag_id and named and remap.start_ns <= stamp_ns <= remap.end_ns:
             return remap.becomes

@@ -218,6 +218,13 @@ def _with_odometry(problem: Problem) -> list[BodyEntry]:
     return [b for b in problem.config.bodies if b.name in problem.odometry]
 
 
+def _with_fake_odometry(problem: Problem) -> list[BodyEntry]:
+    """Moving bodies that are taken to stay about where they are; nowhere where there is real odometry."""
+    if problem.odometry:
+        return []
+    return [b for b in problem.config.bodies if b.fake_odom_noise is not None and not b.is_static]
+
+
 def _odometry_steps(problem: Problem, body: BodyEntry) -> list[tuple[int, int, Float[Array, "4 4"], Float[Array, "6"]]]:
     """(stamp before, stamp after, relative pose of the body, standard deviations (6,)) between answered stamps.
 
@@ -249,9 +256,8 @@ def _add_odometry(problem: Problem, graph: Graph, index: Mapping[Key, int]) -> N
             a, b = index.get(body_key(body, before)), index.get(body_key(body, after))
             if a is not None and b is not None:
                 graph.betweens.append(Between(a, b, delta, np.diag(1 / sigma)))
-    for body in problem.config.bodies:
-        if body.fake_odom_noise is None or body.is_static:
-            continue
+    for body in _with_fake_odometry(problem):
+        assert body.fake_odom_noise is not None
         turn, shift = body.fake_odom_noise
         placed = [s for s in problem.stamps if body_key(body, s) in index]
         for before, after in zip(placed[:-1], placed[1:], strict=True):
@@ -279,9 +285,7 @@ def _carry_rest(problem: Problem, growth: Growth) -> int:
     One pose a body in each direction from every gap's end: what comes after may connect by its tags.
     """
     placed = 0
-    for body in problem.config.bodies:
-        if body.fake_odom_noise is None or body.is_static:
-            continue
+    for body in _with_fake_odometry(problem):
         keys = [body_key(body, s) for s in problem.stamps]
         known = [k in growth.poses for k in keys]
         for i, key in enumerate(keys):
@@ -341,7 +345,7 @@ def _result(problem: Problem, growth: Growth, index: Mapping[Key, int], solution
             if body_key(body, 0) in poses:
                 static[body.name] = poses[body_key(body, 0)]
             continue
-        carried = body.name in problem.odometry or body.fake_odom_noise is not None
+        carried = body.name in problem.odometry or body in _with_fake_odometry(problem)
         answered = poses.keys() if carried else poses.keys() & certain
         stamps = tuple(s for s in problem.stamps if body_key(body, s) in answered)
         stack = np.stack([poses[body_key(body, s)] for s in stamps]) if stamps else np.zeros((0, 4, 4))

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray as Array
 
-from groundtruth.tagslam_yaml import NoisyPose, load, matrix, noisy, time_ns
+from groundtruth import tagslam_checks as checks
+from groundtruth.tagslam_yaml import NoisyPose, load, matrix, noisy, rounded_ns, time_ns
 from recordings.errors import BadInput
 from recordings.geometry import COEFFICIENTS, CameraModel, DistortionModel
 
@@ -109,6 +111,8 @@ class TagSlamConfig:
     """Tags seen flatter than this must have one planar solution that is clearly better:"""
     most_ambiguous: float = 0.3
     """its squared error at most this share of the other's."""
+    notes: tuple[str, ...] = ()
+    """What stands in the files and is not read."""
 
     def body(self, name: str) -> BodyEntry:
         for body in self.bodies:
@@ -123,26 +127,33 @@ def read_config(folder: Path) -> TagSlamConfig:
     poses = load(folder / "camera_poses.yaml") if (folder / "camera_poses.yaml").exists() else {}
     main = load(folder / "tagslam.yaml")
     try:
-        return _config(cameras, poses, main)
+        config = _config(cameras, poses, main)
     except (KeyError, TypeError, ValueError, AttributeError) as wrong:
         raise BadInput(f"{folder}: the TagSLAM configuration is malformed ({type(wrong).__name__}: {wrong})") from wrong
+    _refuse_doubles(config.bodies)
+    _refuse_unplaced_rigs(config)
+    _refuse_moving_measured(config)
+    return config
 
 
 def _config(cameras: Mapping[str, Any], poses: Mapping[str, Any], main: Mapping[str, Any]) -> TagSlamConfig:
     parameters = main.get("tagslam_parameters") or {}
-    defaults = main.get("body_defaults") or {}
-    bodies = tuple(_body(name, entry, defaults) for item in main["bodies"] for name, entry in item.items())
-    _refuse_doubles(bodies)
+    checks.check_mode(parameters)
+    if not main.get("bodies"):
+        raise BadInput("tagslam.yaml has no bodies; wanted a list of them under `bodies`")
     return TagSlamConfig(
-        cameras=tuple(_camera(name, cameras[name], poses.get(name)) for name in sorted(cameras, key=_by_number)),
-        bodies=bodies,
+        cameras=tuple(
+            checks.entry(f"cameras.yaml: {n}", partial(_camera, n, cameras[n], poses.get(n)))
+            for n in checks.camera_names(cameras)
+        ),
+        bodies=_with_fake_odometry(_bodies(main)),
         default_body=main.get("default_body"),
         pixel_noise=float(parameters.get("pixel_noise", 1.0)),
         remaps=tuple(_remaps(main.get("tag_id_remap") or [])),
         squashes=tuple(_squash(s) for s in main.get("squash") or []),
-        planes=_measurements(main.get("plane_measurements")),
-        distances=_measurements(main.get("distance_measurements")),
-        coordinates=_measurements(main.get("coordinate_measurements")),
+        planes=checks.measurements(main, "plane_measurements")[-1:],
+        distances=checks.measurements(main, "distance_measurements"),
+        coordinates=checks.measurements(main, "coordinate_measurements"),
         max_hamming=int(main.get("max_hamming_distance", 100)),
         approximate_sync=bool(parameters.get("use_approximate_sync", False)),
         amnesia=bool(main.get("amnesia", False)),
@@ -150,7 +161,50 @@ def _config(cameras: Mapping[str, Any], poses: Mapping[str, Any], main: Mapping[
         minimum_viewing_deg=float(parameters.get("minimum_viewing_angle", 20.0)),
         ambiguous_deg=float(parameters.get("ambiguity_angle_threshold", 60.0)),
         most_ambiguous=float(parameters.get("max_ambiguity_ratio", 0.3)),
+        notes=tuple(checks.unread(cameras, main)),
     )
+
+
+def _bodies(main: Mapping[str, Any]) -> tuple[BodyEntry, ...]:
+    defaults = main.get("body_defaults") or {}
+    return tuple(
+        checks.entry(f"tagslam.yaml: body '{name}'", partial(_body, name, values, defaults))
+        for item in main["bodies"]
+        for name, values in item.items()
+    )
+
+
+def _with_fake_odometry(bodies: tuple[BodyEntry, ...]) -> tuple[BodyEntry, ...]:
+    """Where one body has fake odometry, all that move have it in TagSLAM: to a radian and a metre where not stated."""
+    if all(b.fake_odom_noise is None for b in bodies):
+        return bodies
+    return tuple(
+        b if b.is_static or b.fake_odom_noise is not None else replace(b, fake_odom_noise=(1.0, 1.0)) for b in bodies
+    )
+
+
+def _refuse_unplaced_rigs(config: TagSlamConfig) -> None:
+    if config.default_body is not None and config.body(config.default_body).default_tag_size_m <= 0:
+        raise BadInput(f"tagslam.yaml: the default body '{config.default_body}' has no default_tag_size")
+    for rig in {c.rig: config.body(c.rig) for c in config.cameras}.values():
+        mine = [c for c in config.cameras if c.rig == rig.name]
+        if any(c.pose is not None for c in mine) or (rig.is_static and rig.pose is not None):
+            continue
+        raise BadInput(
+            f"camera_poses.yaml: no camera on '{rig.name}' ({', '.join(c.name for c in mine)}) has a pose; wanted one "
+            "at least, for it says where the body's frame is"
+        )
+
+
+def _refuse_moving_measured(config: TagSlamConfig) -> None:
+    moving = {tag: body.name for body in config.bodies if not body.is_static for tag in body.tags}
+    for m in (*config.distances, *config.coordinates):
+        for tag in (m[t] for t in ("tag", "tag1", "tag2") if t in m):
+            if int(tag) in moving:
+                raise BadInput(
+                    f"tagslam.yaml: '{m['name']}' measures tag {tag} on '{moving[int(tag)]}', which moves; wanted a "
+                    "static body"
+                )
 
 
 def _refuse_doubles(bodies: tuple[BodyEntry, ...]) -> None:
@@ -164,12 +218,6 @@ def _refuse_doubles(bodies: tuple[BodyEntry, ...]) -> None:
             owner[tag] = body.name
 
 
-def _by_number(name: str) -> tuple[int, str]:
-    """cam2 before cam10: the first camera's stamp is the answer's."""
-    digits = "".join(c for c in name if c.isdigit())
-    return (int(digits) if digits else 0, name)
-
-
 def _camera(name: str, entry: Mapping[str, Any], pose: Mapping[str, Any] | None) -> CameraEntry:
     fx, fy, cx, cy = (float(v) for v in entry["intrinsics"])
     model = MODELS.get(str(entry.get("distortion_model", "radtan")))
@@ -177,8 +225,12 @@ def _camera(name: str, entry: Mapping[str, Any], pose: Mapping[str, Any] | None)
         raise BadInput(
             f"cameras.yaml: {name} has distortion_model '{entry['distortion_model']}'; wanted {list(MODELS)}"
         )
-    wanted = COEFFICIENTS[model]
-    coefficients = ([float(v) for v in entry.get("distortion_coeffs") or []] + [0.0] * wanted)[:wanted]
+    given = [float(v) for v in entry.get("distortion_coeffs") or []]
+    if model == "brown-conrady" and len(given) > COEFFICIENTS[model]:
+        model = "rational"  # OpenCV's order goes on with k4 k5 k6
+    if len(given) > COEFFICIENTS[model]:
+        raise BadInput(f"cameras.yaml: {name} has {len(given)} distortion_coeffs; wanted at most {COEFFICIENTS[model]}")
+    coefficients = given + [0.0] * (COEFFICIENTS[model] - len(given))
     width, height = (int(v) for v in entry["resolution"])
     K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
     camera = CameraModel(name, width, height, K, model, tuple(coefficients))
@@ -278,7 +330,7 @@ def _remaps(entries: list[Mapping[str, Any]]) -> list[Remap]:
     out = []
     for entry in entries:
         for remap in entry["remaps"]:
-            start, end = time_ns(remap.get("start_time", 0)), time_ns(remap.get("end_time", 1e10))
+            start, end = rounded_ns(remap.get("start_time", 0)), rounded_ns(remap.get("end_time", 1e10))
             out.append(Remap(int(entry["id"]), int(remap["remap_id"]), remap.get("camera"), start, end))
     return out
 
@@ -288,7 +340,3 @@ def _squash(entry: Mapping[str, Any]) -> Squash:
     if at is None and camera is None:
         raise BadInput("tagslam.yaml: a squash entry names neither a time nor a camera; wanted at least one of them")
     return Squash(frozenset(int(t) for t in entry["tags"]), None if at is None else time_ns(at), camera)
-
-
-def _measurements(entries: Any) -> tuple[Mapping[str, Any], ...]:
-    return tuple({"name": name, **values} for item in entries or [] for name, values in item.items())

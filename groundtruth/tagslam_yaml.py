@@ -30,8 +30,9 @@ class NoisyPose:
 
 
 def noisy(entry: Mapping[str, Any], rotation_noise: float, position_noise: float) -> NoisyPose:
-    """A pose with its noise: `R`, or `rotation_noise` and `position_noise` by axis, or the two given ones (rad, m)."""
-    if "R" in entry:
+    """A pose with its noise: `rotation_noise` and `position_noise` by axis, or `R`, or the two given ones (rad, m)."""
+    stated = "rotation_noise" in entry and "position_noise" in entry
+    if "R" in entry and not stated:
         # TagSLAM writes R row by row and reads it column by column: what it works with is the transpose
         return NoisyPose(matrix(entry), np.array(entry["R"], dtype=np.float64).reshape(6, 6).T)
     turn = xyz(entry["rotation_noise"]) if "rotation_noise" in entry else np.full(3, rotation_noise)
@@ -57,6 +58,12 @@ def time_ns(value: Any) -> int:
         return int(float(text) * 1e9)
     whole, _, part = text.partition(".")
     return int(whole) * 1_000_000_000 + int((part + "000000000")[:9] or 0)
+
+
+def rounded_ns(value: Any) -> int:
+    """Seconds as TagSLAM reads those of a remap: through a double, which rounds them to a quarter of a microsecond."""
+    seconds = float(value)
+    return int(seconds // 1) * 1_000_000_000 + round((seconds - seconds // 1) * 1e9)
 
 
 def load(path: Path) -> dict[str, Any]:
