@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from dataclasses import asdict
+from typing import Any
 
 import numpy as np
 
@@ -21,7 +23,6 @@ from recordings.tracks import RigCalibration
 TRIES = 12
 MOVES_WITHIN_S = 30.0
 GRASP_SPEED_M_S = 0.05
-DRY_OPENINGS = 10
 OPENS_WITHIN_S = 2.0
 MOVED_M = 0.002
 LEAST_SIGMA_S = 0.004
@@ -89,13 +90,17 @@ class ArmThrower:
         if arm.motion().status == "aborted":
             raise TosslabError(f"the arm did not reach the start: {arm.motion().reason}")
 
-    def calibrate_release(self, openings: int = DRY_OPENINGS) -> ReleaseDelay:
+    def get_ready(self) -> dict[str, Any]:
         """Open the empty hand some times and see how long the fingers take to begin."""
-        if self._gripper is None or self._recorder is None:
-            return self.delay
-        delays = [d for _ in range(openings) if (d := self._opening(self._gripper, self._recorder)) is not None]
-        self.delay = estimate_delay(delays) or self.delay
-        return self.delay
+        openings = self._config.dry_openings
+        if self._gripper is not None and self._recorder is not None and openings:
+            self._operator.say(f"the hand opens {openings} times to measure its delay: keep it empty")
+            delays = [d for _ in range(openings) if (d := self._opening(self._gripper, self._recorder)) is not None]
+            self.delay = estimate_delay(delays) or self.delay
+            mean_ms, sigma_ms = 1e3 * self.delay.mean_s, 1e3 * self.delay.sigma_s
+            said = f"release delay {mean_ms:.0f} ms, sigma {sigma_ms:.0f} ms, of {self.delay.samples} openings"
+            self._operator.say(said if self.delay.samples else f"no opening was seen: {said} as the rig file says")
+        return {"release_delay": asdict(self.delay)}
 
     def over(self) -> bool:
         return False

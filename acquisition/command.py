@@ -80,7 +80,8 @@ def _record(
         operator.say(checks.text())
         _go_on(checks, operator)
         thrower = make_thrower(setup, recorder, operator)
-        start = start_document(args, setup, clock, recorder, checks)
+        measured = {} if args.calibration else thrower.get_ready()
+        start = {**start_document(args, setup, clock, recorder, checks), **measured}
         with interrupts.shield():
             session = open_things.enter_context(open_session(out, start, setup, args.resume, operator))
         if args.calibration:

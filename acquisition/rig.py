@@ -84,6 +84,8 @@ class TossConfig:
     release_delay_s: float = 0.06
     """From the command to the fingers' first movement, before it is measured."""
     release_delay_sigma_s: float = 0.02
+    dry_openings: int = 10
+    """How often the empty hand is opened when a session begins, to measure the two above; 0: they are believed."""
     open_width_m: float = 0.08
     open_speed_m_s: float = 0.1
     grasp_force_n: float = 40.0

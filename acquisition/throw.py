@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 from acquisition.devices import Arm, DeviceLost, DeviceRefused, Gripper, GripperCommand, Motion
 from acquisition.gate import Trouble
@@ -28,6 +28,9 @@ class Thrower(Protocol):
     def learn(self, delay_s: float) -> None:
         """The release delay of a toss, from its data."""
 
+    def get_ready(self) -> dict[str, Any]:
+        """Once, before the first toss: measure what a session needs to know of the gripper. JSON, for the session."""
+
 
 class ByHand:
     """A person tosses."""
@@ -40,6 +43,9 @@ class ByHand:
 
     def learn(self, delay_s: float) -> None:
         pass
+
+    def get_ready(self) -> dict[str, Any]:
+        return {}
 
 
 class Throw:

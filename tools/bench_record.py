@@ -4,18 +4,20 @@ python tools/bench_record.py rates [--seconds 60]       # the lab's rates: nothi
 python tools/bench_record.py soak [--seconds 600]       # half rate: growth of memory; finished takes make room
 python tools/bench_record.py kill [--count 100]         # kill -9 at random instants: recovery, resuming
 python tools/bench_record.py clock                      # mapping error on drifting clocks under load, steps, wraps
+python tools/bench_record.py times [--part 1/2]         # stamps after toss-calibrate time against true mid-exposures
 python tools/bench_record.py detect [--count 200]       # release and impact of simulated tosses against the truth
 python tools/bench_record.py plans [--count 1000]       # random targets: every accepted plan within its limits
 python tools/bench_record.py tags                       # what JPEG does to tag corners in mono images, size and cost
 python tools/bench_record.py faults                     # the injected faults, as tests/acquisition/test_faults.py
 
-kill, detect and plans take --part K/N: the K-th of N shares of the same draws, for machines that others use too.
+kill, times, detect and plans take --part K/N: the K-th of N shares of the same draws, for machines that others use too.
 """
 
-# long because: eight measurements, each a few functions
+# long because: nine measurements, each a few functions
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import random
 import resource
@@ -256,6 +258,70 @@ def clock_run(
     return mapper, np.array(errors)
 
 
+LABS = (
+    {
+        "seed": 31,
+        "skew_ppm": [40.0, -35.0, 25.0, -31.0],
+        "latency_ms": 5.4,
+        "mono_latency_ms": 16.0,
+        "latency_jitter_ms": 2.0,
+        "depth_delay_ms": 6.0,
+    },
+    {
+        "seed": 32,
+        "skew_ppm": [-60.0, 45.0, 45.0, 20.0],
+        "latency_ms": 9.0,
+        "mono_latency_ms": 1.2,
+        "latency_jitter_ms": 4.0,
+        "depth_delay_ms": -4.0,
+    },
+)
+"""What is wrong with the clocks of a lab; two grey cameras on one trigger, one frame in a hundred lost."""
+
+
+def lab_toml(wrong: dict[str, Any]) -> str:
+    """A rig file of that lab. It states the D455's latency, which no data can tell, and nothing of the others."""
+    entries = [("d455", "rgbd", 30, wrong["latency_ms"]), ("mono0", "mono", 30, 0.0), ("mono1", "mono", 30, 0.0)]
+    entries += [("arm", "arm", 1000, 0.0), ("gripper", "gripper", 50, 0.0)]
+    devices = "".join(
+        f'[devices.{name}]\nkind = "{kind}"\ndriver = "synthetic"\nrate_hz = {rate}\nlatency_ms = {latency}\n'
+        for name, kind, rate, latency in entries
+    )
+    simulation = "".join(f"{key} = {value}\n" for key, value in wrong.items())
+    return (
+        f'name = "times"\nrobot = "panda"\n{devices}[recording]\ncountdown_s = 0\nqueue_s = 4\nlongest_gap_s = 3\n'
+        f"[simulation]\n{simulation}mono_cameras = 2\ncolor_size = [560, 400]\ncolor_focal_px = 640.0\n"
+        "mono_size = [480, 360]\ndropped_share = 0.01\n"
+    )
+
+
+def bench_times(part: str) -> bool:
+    """A toss of each lab, recorded, calibrated by its own motion, compared with the simulation's exposures."""
+    from acquisition.cli import main as toss_record
+    from acquisition.synthetic.beside import stamp_errors_ms
+    from calibration.cli import main as toss_calibrate
+
+    good = True
+    for number in share(len(LABS), part):
+        with tempfile.TemporaryDirectory() as place:
+            rig_file, out, truth = Path(place) / "lab.toml", Path(place) / "out", Path(place) / "out_truth"
+            rig_file.write_text(lab_toml(LABS[number]))
+            assert toss_record(["--rig", str(rig_file), "--yes", str(out)]) == 0
+            before = stamp_errors_ms(out, truth)
+            size_m = json.loads((truth / "object_tags.json").read_text())["tags"][0]["size_m"]
+            assert toss_calibrate(["time", str(out), "--tag-size", str(size_m)]) == 0
+            after = stamp_errors_ms(out, truth)
+        print(f"stamps after toss-calibrate time, lab {number + 1}: {LABS[number]} (wanted: all within 1 ms)")
+        for topic, errors in after.items():
+            worst = float(np.abs(errors).max())
+            good &= worst <= 1.0
+            print(
+                f"  {topic:<13} {len(errors)} frames: mean {errors.mean():+.3f} (before {before[topic].mean():+.3f}), "
+                f"std {errors.std():.3f}, worst {worst:.3f} ms"
+            )
+    return good
+
+
 def bench_detect(count: int, part: str) -> bool:
     """Motions of the simulated lab, depth at thumbnail size, widths at 50 Hz: nothing else is rendered."""
     per_lab = 25
@@ -429,6 +495,7 @@ def main() -> int:
         "clock": bench_clock,
         "plans": lambda: bench_plans(args.count or 1000, args.part),
         "tags": bench_tags,
+        "times": lambda: bench_times(args.part),
         "rates": lambda: bench_rates(args.seconds or 60.0),
         "soak": lambda: bench_soak(args.seconds or 600.0),
         "kill": lambda: bench_kill(args.count or 100, args.part),

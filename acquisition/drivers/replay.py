@@ -350,6 +350,9 @@ class ReplayThrower:
     def learn(self, delay_s: float) -> None:
         pass
 
+    def get_ready(self) -> dict[str, Any]:
+        return {}
+
 
 def replay_setup(path: Path) -> Setup:
     """A rig whose devices play a session."""

@@ -650,3 +650,6 @@ class SyntheticThrower:
 
     def learn(self, delay_s: float) -> None:
         pass
+
+    def get_ready(self) -> dict[str, Any]:
+        return {}

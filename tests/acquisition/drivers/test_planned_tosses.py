@@ -152,6 +152,7 @@ position_m = [0.0, 0.1, 0.35]
 velocity_m_s = [0.0, -0.6, 0.5]
 spin_rad_s = [-3.0, 0.0, 0.0]
 world_from_base = [0.0, 0.6, 0.0, -90.0]
+dry_openings = 4
 """
 
 
@@ -161,11 +162,14 @@ def test_toss_record_tosses_with_a_panda(fci: tuple[str, Apart], tmp_path: Path)
     rig.write_text(PANDA_RIG.replace("ADDRESS", fci[0]))
     assert main(["--rig", str(rig), "--yes", str(out)]) == 0
     with Session.open(out) as session:
+        delay = session.start["release_delay"]
         toss = session.toss(0)
         states, command = toss.arm_states(), toss.command()
         release = next(e for e in toss.events() if e.kind == "release")
     assert states is not None
     assert command is not None
+    assert delay["samples"] >= 3
+    assert 0 < delay["mean_s"] < 0.5
     assert np.abs(states.dq_rad_s).max() > 0.5
     assert 0 < (release.time_ns - command.time_ns) * 1e-9 < 1.5
     assert release.sigma_s > 0
