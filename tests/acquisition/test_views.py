@@ -1,0 +1,81 @@
+"""Views of the calibration board: what is still missing is said in words, what is recorded calibrates."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from acquisition.cli import main
+from acquisition.views import PER_CAMERA, Coverage, progress_text, tilt_of
+from calibration.targets import TargetView
+from recordings.session import Session, Toss
+
+RIG = """name = "views"
+robot = "panda"
+[devices.d455]
+kind = "rgbd"
+driver = "synthetic"
+[devices.mono0]
+kind = "mono"
+driver = "synthetic"
+[devices.arm]
+kind = "arm"
+driver = "synthetic"
+rate_hz = 200
+[simulation]
+seed = 3
+color_size = [424, 240]
+mono_size = [480, 360]
+mono_cameras = 1
+board_views = 3
+"""
+
+
+def view(middle_px: tuple[float, float], tilt: tuple[float, float] = (0.0, 0.0)) -> TargetView:
+    """A board of 20 cm seen about `middle_px`, 1 m away, turned about its axes by `tilt`."""
+    grid = np.stack(np.meshgrid(np.linspace(-0.1, 0.1, 4), np.linspace(-0.1, 0.1, 4)), -1).reshape(-1, 2)
+    points = np.column_stack([grid, np.zeros(len(grid))])
+    depth = 1.0 + np.tan(tilt[0]) * grid[:, 0] + np.tan(tilt[1]) * grid[:, 1]
+    pixels = np.array(middle_px) + 400 * grid / depth[:, None]
+    return TargetView(np.arange(len(grid)), points, pixels, np.tile(0.01 * np.eye(2), (len(grid), 1, 1)))
+
+
+def test_a_camera_that_has_seen_nothing_wants_everything() -> None:
+    wanted = Coverage().missing()
+    assert wanted[0] == f"{PER_CAMERA} more views"
+    assert any("top left" in text for text in wanted)
+    assert "other tilts than none" in wanted
+
+
+def test_a_board_that_was_everywhere_and_tilted_is_enough() -> None:
+    covered = Coverage()
+    for k in range(PER_CAMERA):
+        at = (80.0 + 160 * (k % 3), 60.0 + 120 * (k // 3 % 3))
+        covered.add(view(at, ((0.0, 0.0), (0.6, 0.0), (0.0, 0.6))[k % 3]), 480, 360)
+    assert covered.missing() == []
+    assert progress_text(1, 30, {"d455": covered}) == "view 1 of 30: every camera has seen enough"
+
+
+def test_the_tilt_is_told_from_the_outline() -> None:
+    assert tilt_of(view((200.0, 200.0))) == "flat"
+    sides = {tilt_of(view((200.0, 200.0), tilt)) for tilt in ((0.6, 0.0), (-0.6, 0.0), (0.0, 0.6), (0.0, -0.6))}
+    assert sides == {"right side far", "left side far", "upper side far", "lower side far"}
+
+
+@pytest.mark.slow
+def test_views_of_the_simulated_board_are_recorded_and_what_is_missing_is_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rig, out = tmp_path / "rig.toml", tmp_path / "out"
+    rig.write_text(RIG)
+    assert main(["--rig", str(rig), "--calibration", "board", "--yes", str(out)]) == 1  # three views are too few
+    said = capsys.readouterr()
+    assert "d455 wants" in said.err
+    assert "more views" in said.out
+    with Session.open(out) as session:
+        assert session.start["board"]["kind"] == "tags"
+    with Toss(out / "calibration.mcap") as views:
+        assert 2 <= len(views.color()) <= 3
+        assert len(views.mono("mono0")) == len(views.color())
