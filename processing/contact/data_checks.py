@@ -31,7 +31,7 @@ LONGEST_FALL_S = 0.2
 """Lengths of the windows in which a fall is looked for: a longer one at 30 Hz would span an impact."""
 MOST_FALL_ERROR_M_S2 = 0.4
 """A window that knows its acceleration less well proves nothing."""
-SAME_HEIGHT_M = 1e-8
+SAME_HEIGHT_M, SAME_TILT = 1e-8, 1e-5
 SAME_FRAMES = 30
 IMPACT_M_S = 0.3
 
@@ -271,22 +271,24 @@ def check_plane(heights_m: Mapping[int, float], what: str) -> float | None:
 
 
 def duplicate_groups(tosses: Sequence[PoseSeries]) -> list[tuple[int, ...]]:
-    """Groups of tosses that are one recording: equal heights over their first frames (turning about z keeps them)."""
+    """Groups of tosses that are one recording: equal heights and tilts over their first frames (turning about z keeps
+    both; heights alone are also equal where a simulation drops everything from one height)."""
     groups: list[tuple[int, ...]] = []
     taken: set[int] = set()
     for i, a in enumerate(tosses):
         if a.toss in taken:
             continue
-        same = [b.toss for b in tosses[i + 1 :] if b.toss not in taken and _same_heights(a, b)]
+        same = [b.toss for b in tosses[i + 1 :] if b.toss not in taken and _same_course(a, b)]
         if same:
             groups.append((a.toss, *same))
             taken.update(groups[-1])
     return groups
 
 
-def _same_heights(a: PoseSeries, b: PoseSeries) -> bool:
+def _same_course(a: PoseSeries, b: PoseSeries) -> bool:
     n = min(len(a), len(b), SAME_FRAMES)
-    return bool(np.abs(a.position_m[:n, 2] - b.position_m[:n, 2]).max() < SAME_HEIGHT_M)
+    higher = np.abs(a.position_m[:n, 2] - b.position_m[:n, 2]).max()
+    return bool(higher < SAME_HEIGHT_M and np.abs(a.rotation[:n, 2] - b.rotation[:n, 2]).max() < SAME_TILT)
 
 
 def refuse_leaks(train: Sequence[int], test: Sequence[int], groups: Sequence[Sequence[int]]) -> None:

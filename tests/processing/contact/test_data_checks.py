@@ -142,6 +142,12 @@ def test_duplicates_are_found_and_refused_across_the_split(simulated_tosses):
     checks.refuse_leaks([1, 9], [2], groups)
 
 
+def test_tosses_dropped_from_one_height_are_no_duplicates(simulated_tosses):
+    """As simulations make them: the centre falls alike until something touches, but they turn differently."""
+    first, second = (t.part(slice(0, 20)) for t in simulated_tosses(2))
+    assert checks.duplicate_groups([first, replace(second, position_m=first.position_m.copy())]) == []
+
+
 def test_flight_alone_teaches_nothing(simulated_tosses, box_physics):
     tracks = [t.part(slice(0, 12)) for t in simulated_tosses(3)]
     higher = [replace(t, position_m=t.position_m + [0, 0, 1.0]) for t in tracks]
