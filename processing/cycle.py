@@ -285,7 +285,7 @@ def judge_stage(run: Run, name: str, tracks: Mapping[int, Done], shapes: Mapping
         write_json(folder / "evidence.json", every.evidence().to_json())
         return every.evidence().to_json()
 
-    return run.store.run("judge", 2, run.config.cycle.judge, inputs, compute)
+    return run.store.run("judge", 3, run.config.cycle.judge, inputs, compute)
 
 
 def judged_frames(judged: Done) -> Explained:

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Float32, UInt8
 from numpy import ndarray as Array
 from scipy.stats import t as student
 
@@ -41,7 +41,7 @@ class JudgeConfig:
 @dataclass(frozen=True)
 class Evidence:
     """Means over the frames looked at (`frames`): absolute depth residual (m), 1 - IoU of the outline, colour residual
-    (grey levels of 255, after each frame's own gain; NaN without colours). `lost`: frames without a pose."""
+    (grey levels of 255, after each frame's own light; NaN without colours). `lost`: frames without a pose."""
 
     depth_m: float
     mask: float
@@ -134,8 +134,8 @@ def explain(
             lost += int(mask.any())
             continue
         frame = frames[i]
-        depth_m, rgb = drawer.draw(pose)
-        seen = depth_m > 0
+        drawn = drawer.draw(pose)
+        depth_m, seen = drawn.depth_m, drawn.depth_m > 0
         hidden = seen & ~mask & (frame.depth_m > 0) & (frame.depth_m < depth_m - HIDDEN_M)  # a hand stands before it
         union = float(((seen & ~hidden) | mask).sum())
         inside = cv2.erode(mask.astype(np.uint8), kernel).astype(bool)
@@ -145,7 +145,7 @@ def explain(
         if not np.isfinite(depth):
             continue
         both = inside & seen
-        rows.append((track.toss, i, depth, 1 - float((seen & mask).sum()) / union, _color(frame, rgb, both)))
+        rows.append((track.toss, i, depth, 1 - float((seen & mask).sum()) / union, _color(frame, drawn, both)))
     return Explained(np.array(rows, dtype=np.float64).reshape(-1, 5), lost)
 
 
@@ -154,32 +154,52 @@ def pooled(parts: Sequence[Explained]) -> Explained:
     return Explained(np.concatenate([p.rows for p in parts]), sum(p.lost for p in parts))
 
 
-def _color(frame: RgbdFrame, rgb: UInt8[Array, "h w 3"] | None, both: Bool[Array, "h w"]) -> float:
-    """Median absolute difference of grey, after the gain and offset that fit the frame best."""
-    if rgb is None or both.sum() < 50:
+def _color(frame: RgbdFrame, drawn: Drawn, both: Bool[Array, "h w"]) -> float:
+    """Median absolute difference of grey, after the light that fits the frame best.
+
+    Faces are lit by where they point to (Lambert, and light from everywhere): grey = albedo * (a + b . n) + c.
+    """
+    if drawn.rgb is None or both.sum() < 50:
         return float("nan")
-    drawn = rgb[both].astype(np.float64).mean(-1)
+    albedo = drawn.rgb[both].astype(np.float64).mean(-1)
     taken = frame.color_rgb[both].astype(np.float64).mean(-1)
-    spread = drawn.std()
-    gain = float(np.clip(((drawn - drawn.mean()) * (taken - taken.mean())).mean() / max(spread**2, 1.0), 0.3, 3.0))
-    return float(np.median(np.abs(taken - taken.mean() - gain * (drawn - drawn.mean()))))
+    terms = np.column_stack([albedo, albedo[:, None] * drawn.normal[both], np.ones(len(albedo))])
+    light, *_ = np.linalg.lstsq(terms, taken, rcond=LIGHT_RCOND)
+    return float(np.median(np.abs(taken - terms @ light)))
+
+
+LIGHT_RCOND = 1e-3
+"""Of the light's terms: with one face in view, what its direction adds cannot be told from what all light adds."""
+
+
+@dataclass(frozen=True, eq=False)
+class Drawn:
+    """A shape drawn at a pose: depth (m, 0 outside), colours (None for a shape without any), normals (object frame)."""
+
+    depth_m: Float32[Array, "h w"]
+    rgb: UInt8[Array, "h w 3"] | None
+    normal: Float32[Array, "h w 3"]
 
 
 class ShapeDrawer:
-    """Depth and colours of a shape at a pose, through the lens as it is."""
+    """Depth, colours and normals of a shape at a pose, through the lens as it is."""
 
     def __init__(self, shape: ObjectShape, camera: CameraModel) -> None:
         self._renderer = RaycastRenderer(shape, camera)
         self._rgb = None if shape.vertex_rgb is None else shape.vertex_rgb.astype(np.float32)
         self._faces = shape.faces
+        a, b, c = np.moveaxis(shape.vertices_m[shape.faces], 1, 0)
+        across = np.cross(b - a, c - a)
+        self._normals = (across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-12)).astype(np.float32)
 
-    def draw(self, camera_from_object: Float[Array, "4 4"]) -> tuple[Array, UInt8[Array, "h w 3"] | None]:
-        """Depth (m, 0 outside) and colours, None for a shape without any."""
+    def draw(self, camera_from_object: Float[Array, "4 4"]) -> Drawn:
+        """The shape at a pose."""
         depth_m, face, weight = self._renderer.hits(camera_from_object)
-        if self._rgb is None:
-            return depth_m, None
-        rgb = np.zeros((*depth_m.shape, 3), dtype=np.uint8)
         seen = depth_m > 0
+        normal = np.where(seen[..., None], self._normals[face], np.float32(0))
+        if self._rgb is None:
+            return Drawn(depth_m, None, normal)
+        rgb = np.zeros((*depth_m.shape, 3), dtype=np.uint8)
         corners = self._rgb[self._faces[face[seen]]]
         rgb[seen] = np.clip((corners * weight[seen][..., None]).sum(1), 0, 255).astype(np.uint8)
-        return depth_m, rgb
+        return Drawn(depth_m, rgb, normal)

@@ -14,6 +14,8 @@ from processing.reproject import Occlusion, Renderer, Reprojection, reproject
 from recordings.records import RgbdFrame
 
 Depth = Literal["rendered", "filled"]
+BESIDE_PX = 9
+"""Width of the window round a pixel in front of the object in which missing depth is its doing."""
 
 
 @dataclass(frozen=True)
@@ -68,8 +70,14 @@ def _filled(
     in_front: Bool[Array, "h w"],
     config: RedrawConfig,
 ) -> tuple[Bool[Array, "h w"], Float32[Array, "h w"]]:
-    """Where the camera saw past the shape, it is not there; what it saw of the object stays, also beside the shape."""
-    unknown = drawn.mask & ~raw_mask & ((depth_m == 0) | in_front)
+    """Where the camera saw past the shape, it is not there; what it saw of the object stays, also beside the shape.
+
+    Missing depth beside the mask says nothing by itself: the mask saw the colours there.
+    """
+    import cv2
+
+    beside = cv2.dilate(in_front.astype(np.uint8), np.ones((BESIDE_PX, BESIDE_PX), np.uint8)) > 0  # shadows of stereo
+    unknown = drawn.mask & ~raw_mask & (in_front | (beside & (depth_m == 0)))
     wrong = raw_mask & drawn.mask & ((depth_m == 0) | (np.abs(depth_m - drawn.depth_m) > config.agrees_m))
     return raw_mask | unknown, np.where(unknown | wrong, drawn.depth_m, depth_m).astype(np.float32)
 

@@ -14,7 +14,7 @@ from processing.icp import IcpConfig, align_frames, count_verdicts
 from processing.judge import JudgeConfig
 from processing.reproject import RendererName, make_renderer
 from processing.reprojected import RedrawConfig, SecondFrames
-from processing.stage import Counts, Done
+from processing.stage import Counts, Done, plain
 from processing.track.multi_hypothesis import read_toss_track, write_toss_track
 from processing.track.register import register_tosses
 from processing.track.sequence import track_toss
@@ -41,7 +41,8 @@ class CycleConfig:
     renderer: RendererName = "raycast"
     start: Start = "shape"
     """`anew` (the paper): the second pass is given the first pose only. `poses`: the poses at which the shape was drawn
-    are refined, only lost frames are sought. `shape`: the same, and the shape's own surface and colours take part."""
+    are refined, only lost frames are sought. `shape`: the same, and the shape's own surface and colours take part; where
+    no frame looks, it stays."""
     apart_mask: float = 0.12
     """A toss whose outline the common shape misses by more (1 - IoU, median over frames) is not of that shape."""
     much_worse: float = 0.02
@@ -81,7 +82,7 @@ def align_stage(
             write_masks(folder, toss, second.masks, read_masks(masks[toss].folder, toss).confidence)
         return {"icp": total}
 
-    return run.store.run("reproject", 2, config, inputs, compute)
+    return run.store.run("reproject", 3, config, inputs, compute)
 
 
 def _laid_on_depth(
@@ -203,11 +204,13 @@ def second_field(
             own = read_track(track.folder, toss)
             views.append(TossViews(frames, frames.depth_times_ns, frames.masks, own, frames.colorless))
         progress = run.progress(f"{name}: shape, second pass")
-        learned, used = learn_shape(views, run.camera, run.config.shape, run.device, progress)
+        believed = body if run.config.cycle.start == "shape" else None
+        learned, used = learn_shape(views, run.camera, run.config.shape, run.device, progress, believed)
         write_shape(folder, learned)
         return {"views": used, "vertices": len(learned.vertices_m)}
 
-    return run.store.run("field", 2, run.config.shape, inputs, compute)
+    config = {"shape": plain(run.config.shape), "start": run.config.cycle.start}
+    return run.store.run("field", 3, config, inputs, compute)
 
 
 def input_keys(tracks: Mapping[int, Done], masks: Mapping[int, Done]) -> dict[str, str]:

@@ -7,7 +7,7 @@ not biased along the ray (projective distance would be). Curless and Levoy 1996 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import no_type_check
 
 import numba
@@ -15,9 +15,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 from numpy import ndarray as Array
 from scipy import ndimage
-from scipy.spatial import ConvexHull, QhullError
+from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from processing.field.views import FieldView, object_box
+from recordings.tracks import ObjectShape
 
 BEHIND_FULL = np.float32(0.3)
 """Cells further behind a surface than this share of the truncation count less and less: near an edge they belong to
@@ -56,12 +57,15 @@ class Grid:
         return self.origin_m + self.voxel_m * cells
 
 
-def fuse(views: Sequence[FieldView], config: FuseConfig) -> Grid:
-    """Average the views' signed distances on a grid round the object and complete what no view saw.
+def fuse(views: Sequence[FieldView], config: FuseConfig, believed: ObjectShape | None = None) -> Grid:
+    """Average the views' signed distances on a grid round the object and complete what no view saw: by the shape that
+    is believed so far (in the views' object frame), or by the hull of what was seen.
 
     Raises BadInput when the views hold too few depth points.
     """
     low, high = object_box(views)
+    if believed is not None:
+        low, high = np.minimum(low, believed.vertices_m.min(0)), np.maximum(high, believed.vertices_m.max(0))
     low, high = low - config.border_m, high + config.border_m
     voxel_m = max(config.voxel_m, float(np.cbrt(np.prod(high - low) / config.most_cells)))
     shape = tuple(int(n) for n in np.ceil((high - low) / voxel_m).astype(int) + 1)
@@ -91,7 +95,11 @@ def fuse(views: Sequence[FieldView], config: FuseConfig) -> Grid:
     free = passed > np.maximum(2.0, 0.2 * blocked)
     sdf_m = np.where(weight > 0, total / np.maximum(weight, 1e-9), 0).astype(np.float32)
     rgb = paint[..., :3] / np.maximum(paint[..., 3:], 1e-9)
-    return complete(Grid(low, voxel_m, config.truncation_m, sdf_m, weight, free, _spread(rgb, paint[..., 3] > 0)))
+    grid = Grid(low, voxel_m, config.truncation_m, sdf_m, weight, free, rgb)
+    painted = paint[..., 3] > 0
+    if believed is None:
+        return replace(complete(grid), rgb=_spread(rgb, painted))
+    return _believing(grid, believed, painted)
 
 
 def _spread(rgb: Float32[Array, "a b c 3"], known: Bool[Array, "a b c"]) -> Float32[Array, "a b c 3"]:
@@ -159,19 +167,50 @@ def complete(grid: Grid) -> Grid:
 
     What the object looks like where nobody looked is a guess, and the mesh marks it as unobserved.
     """
-    seen = (grid.weight > 0) & ~(grid.free & (grid.sdf_m <= 0))
     surface = np.argwhere((grid.weight > 0) & (np.abs(grid.sdf_m) < grid.voxel_m) & ~grid.free)
-    unseen_inside = inside_hull(grid.sdf_m.shape, surface) & ~seen & ~grid.free
-    solid = np.where(seen, grid.sdf_m < 0, unseen_inside)
+    return _completed(grid, inside_hull(grid.sdf_m.shape, surface))
+
+
+def _believing(grid: Grid, believed: ObjectShape, painted: Bool[Array, "a b c"]) -> Grid:
+    """Fill what no view saw with the distances and colours of a shape, but for where a ray passed."""
+    unseen = (grid.weight == 0) & ~grid.free
+    cells = np.argwhere(unseen)
+    distance_m = np.full(grid.sdf_m.shape, np.inf, dtype=np.float32)
+    distance_m[unseen] = _signed_distance(believed, grid.points(cells.astype(np.float64)))
+    filled = _completed(grid, distance_m < 0)
+    close = unseen & (np.abs(distance_m) < grid.truncation_m)
+    rgb = grid.rgb.copy()
+    if believed.vertex_rgb is not None:
+        shown = close & ~painted
+        _, nearest = cKDTree(believed.vertices_m).query(grid.points(np.argwhere(shown).astype(np.float64)))
+        rgb[shown] = believed.vertex_rgb[nearest] / np.float32(255)
+        painted = painted | shown
+    return replace(filled, sdf_m=np.where(close, distance_m, filled.sdf_m), rgb=_spread(rgb, painted))
+
+
+def _signed_distance(shape: ObjectShape, points_m: Float[Array, "n 3"]) -> Float32[Array, " n"]:
+    """Of points to a closed surface, metres, negative inside."""
+    import open3d
+
+    scene = open3d.t.geometry.RaycastingScene(nthreads=1)
+    scene.add_triangles(
+        open3d.core.Tensor(shape.vertices_m.astype(np.float32)), open3d.core.Tensor(shape.faces.astype(np.uint32))
+    )
+    found = scene.compute_signed_distance(open3d.core.Tensor(points_m.astype(np.float32)), nthreads=1)
+    return np.asarray(found.numpy())
+
+
+def _completed(grid: Grid, unseen_inside: Bool[Array, "a b c"]) -> Grid:
+    """The grid with distances everywhere: measured near what views saw, elsewhere to the nearest change of side."""
+    seen = (grid.weight > 0) & ~(grid.free & (grid.sdf_m <= 0))
+    solid = np.where(seen, grid.sdf_m < 0, unseen_inside & ~seen & ~grid.free)
     distance_m = grid.voxel_m * (ndimage.distance_transform_edt(~solid) - ndimage.distance_transform_edt(solid)).astype(
         np.float32
     )
     distance_m -= np.sign(distance_m) * np.float32(0.5 * grid.voxel_m)
     near = seen & (np.abs(grid.sdf_m) < 0.999 * grid.truncation_m)
     sdf_m = np.where(near, grid.sdf_m, distance_m).astype(np.float32)
-    return Grid(
-        grid.origin_m, grid.voxel_m, grid.truncation_m, sdf_m, np.where(seen, grid.weight, 0), grid.free, grid.rgb
-    )
+    return replace(grid, sdf_m=sdf_m, weight=np.where(seen, grid.weight, 0))
 
 
 def inside_hull(shape: tuple[int, ...], cells: Int[Array, "n 3"]) -> Bool[Array, "a b c"]:

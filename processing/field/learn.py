@@ -40,14 +40,20 @@ class TossViews:
 
 
 def learn_shape(
-    tosses: Sequence[TossViews], camera: CameraModel, config: LearnConfig, device: str, progress: Progress
+    tosses: Sequence[TossViews],
+    camera: CameraModel,
+    config: LearnConfig,
+    device: str,
+    progress: Progress,
+    believed: ObjectShape | None = None,
 ) -> tuple[ObjectShape, int]:
-    """The shape of an object in the frame that all tracks share, and how many views it was learned from.
+    """The shape of an object in the frame that all tracks share, and how many views it was learned from. Where none of
+    them looks it is the shape `believed` so far, if there is one.
 
     Raises BadInput where no tracked frame shows the object.
     """
     views = chosen_views(tosses, camera, config)
-    trained = train_field(views, config.field, device, progress)
+    trained = train_field(views, config.field, device, progress, believed)
     frame = tosses[0].track.object_frame
     return extract_mesh(trained.field, trained.grid, frame, "neural field"), len(views)
 

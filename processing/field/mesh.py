@@ -41,9 +41,16 @@ def surface_of(sdf_m: Float32[Array, "a b c"], grid: Grid) -> tuple[Float[Array,
     cleaned = np.where((sdf_m < 0) & (solid != largest), grid.voxel_m, sdf_m)
     cleaned = np.where(near_largest, cleaned, np.maximum(cleaned, 0.1 * grid.voxel_m))
     cleaned = _fill_cavities(cleaned, grid.voxel_m)
+    least = np.float32(LEAST_SHARE * grid.voxel_m)
+    cleaned = np.where(np.abs(cleaned) < least, np.where(cleaned < 0, -least, least), cleaned)
     padded = np.pad(cleaned, 1, constant_values=grid.truncation_m)
     vertices, faces, _, _ = marching_cubes(padded, 0.0)
     return grid.points(vertices.astype(np.float64) - 1), faces.astype(np.int64)
+
+
+LEAST_SHARE = 1e-3
+"""Of a cell's edge: a surface nearer to a cell's corner is moved away that far, because triangles that meet in the
+corner would have no area."""
 
 
 def _fill_cavities(sdf_m: Float32[Array, "a b c"], voxel_m: float) -> Float32[Array, "a b c"]:

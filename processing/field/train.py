@@ -24,6 +24,7 @@ from processing.field.rays import RayPool, make_pool
 from processing.field.views import FieldView
 from recordings.geometry import nearest_rotation
 from recordings.progress import Progress, Silent
+from recordings.tracks import ObjectShape
 
 
 @dataclass(frozen=True)
@@ -66,9 +67,15 @@ class TrainedField:
 
 
 def train_field(
-    views: Sequence[FieldView], config: FieldConfig, device: str = "cpu", progress: Progress | None = None
+    views: Sequence[FieldView],
+    config: FieldConfig,
+    device: str = "cpu",
+    progress: Progress | None = None,
+    believed: ObjectShape | None = None,
 ) -> TrainedField:
     """Refine the poses and learn the field of one object. Raises BadInput when the views hold too few depth points.
+
+    `believed`: a shape, in the views' object frame, for what no view sees; without it that is the hull of the rest.
 
     Rounds of fusing and Gauss-Newton come first, because they are cheap; the network is trained once, at the end.
     """
@@ -81,7 +88,7 @@ def train_field(
         start = ObjectField(fuse(views, config.fuse), config.encoding).to(device)
         views, information = refined_views(start, views, pool, config.poses)
         progress.step(done + 1, total, "field: poses")
-    grid = fuse(views, config.fuse)
+    grid = fuse(views, config.fuse, believed)
     model = ObjectField(grid, config.encoding).to(device)
     losses = _optimise(model, stack_poses(views, device), pool, config, progress)
     return TrainedField(model, grid, tuple(views), information, losses)

@@ -16,7 +16,7 @@ from processing.cycle import placement
 from processing.field.learn import LearnConfig
 from processing.field.train import FieldConfig
 from processing.icp import IcpConfig, ShapeSurface, align_frame
-from processing.judge import JudgeConfig, explain
+from processing.judge import JudgeConfig, ShapeDrawer, explain
 from processing.reproject import RaycastRenderer
 from processing.reprojected import RedrawConfig, SecondFrames, redraw
 from recordings.geometry import rotation_exp
@@ -76,6 +76,16 @@ def test_a_drawn_frame_keeps_the_cameras_depth_where_it_agrees_and_fills_the_res
     assert (papers.frame.depth_m[drawn.mask] == renderer.depth(camera_from_object)[drawn.mask]).all()
 
 
+def test_missing_depth_beside_the_mask_does_not_make_the_object_grow(tiny_world: Any) -> None:
+    pose = tiny_world.poses(3)[1]
+    frame, mask = tiny_world.see(pose, 1)
+    camera_from_object = (tiny_world.world_from_camera.inverse() @ pose).matrix
+    raw = replace(frame, depth_m=np.where(mask, frame.depth_m, 0).astype(np.float32))
+    swollen = replace(box_shape(), vertices_m=1.1 * box_shape().vertices_m)
+    drawn = redraw(raw, mask, camera_from_object, RaycastRenderer(swollen, tiny_world.camera), RedrawConfig())
+    assert (drawn.mask == mask).all()
+
+
 def test_what_a_hand_hides_is_filled_without_colour_or_cut_out(tiny_world: Any) -> None:
     pose = tiny_world.poses(3)[1]
     frame, mask = tiny_world.see(pose, 1, hand=True)
@@ -113,6 +123,22 @@ def test_a_worse_pose_explains_the_raw_images_worse(tiny_world: Any, error: np.n
     assert true.frames == wrong.frames == 4
     assert true.depth_m < 0.6 * wrong.depth_m
     assert true.mask < wrong.mask
+
+
+def test_colours_are_compared_after_the_light_on_each_face(tiny_world: Any) -> None:
+    """A grey box whose faces the light makes differently bright: nothing of that is a wrong pose."""
+    pose = tiny_world.poses(4)[1]
+    _, mask = tiny_world.see(pose, 1)
+    camera_from_object = (tiny_world.world_from_camera.inverse() @ pose).matrix
+    drawn = ShapeDrawer(box_shape(), tiny_world.camera).draw(camera_from_object)
+    lit = np.clip(128 * (0.5 + drawn.normal @ np.array([0.3, -0.2, 0.4])), 0, 255)
+    frame, _ = tiny_world.see(pose, 1)
+    shown = replace(frame, color_rgb=np.repeat(lit[..., None], 3, -1).astype(np.uint8))
+    found = explain(
+        box_shape(), track_of(camera_from_object[None]), [shown], [mask], tiny_world.camera, JudgeConfig(every=1)
+    ).evidence()
+    assert found.color < 1.0
+    assert len(np.unique(lit[drawn.depth_m > 0].round())) > 1
 
 
 def test_a_lost_frame_counts_as_lost_and_never_as_explained(tiny_world: Any) -> None:

@@ -17,7 +17,7 @@ from processing.field.views import FieldView, make_view
 from recordings.errors import BadInput
 from recordings.geometry import CameraModel
 from recordings.records import RgbdFrame
-from recordings.tracks import ObjectTrack
+from recordings.tracks import ObjectShape, ObjectTrack
 
 HALF_M = 0.04
 RED_OF_FACE = (60, 140, 220)
@@ -99,6 +99,29 @@ def test_what_no_view_saw_is_closed_and_marked_unobserved():
     seen, unseen = shape.vertices_m[shape.observed], shape.vertices_m[~shape.observed]
     assert len(unseen) > 100
     assert unseen[:, 2].mean() > seen[:, 2].mean() + 0.02  # the side turned away from every camera
+
+
+def test_what_no_view_saw_stays_as_a_shape_is_believed_to_be_and_what_views_saw_does_not():
+    import trimesh
+
+    turns = [Rotation.from_euler("xyz", [a, b, 0]) for a in (-0.7, 0.0, 0.7) for b in (-0.7, 0.0, 0.7)]
+    views = []
+    for turn in turns:
+        frame, mask = draw(looking_at_cube(turn))
+        views.append(make_view(frame, mask, CAMERA, looking_at_cube(turn), looking_at_cube(turn)))
+    longer_m = 0.012  # than the cube, on both sides of z: one of them is in view
+    box = trimesh.creation.box([2 * HALF_M, 2 * HALF_M, 2 * (HALF_M + longer_m)]).subdivide().subdivide()
+    green = np.tile(np.array([0, 255, 0], dtype=np.uint8), (len(box.vertices), 1))
+    believed = ObjectShape("object", "test", np.asarray(box.vertices), np.asarray(box.faces), green)
+    grid = fuse(views, FuseConfig(truncation_m=0.005), believed)
+    shape = grid_mesh(grid)
+    assert shape.vertices_m[:, 2].max() == pytest.approx(HALF_M + longer_m, abs=0.001)
+    assert shape.vertices_m[:, 2].min() > -HALF_M - 0.2 * longer_m
+    assert np.quantile(np.abs(distance_to_cube_m(shape.vertices_m[shape.observed])), 0.9) < 0.001
+    assert trimesh.Trimesh(shape.vertices_m, shape.faces).is_watertight
+    assert shape.observed[shape.vertices_m[:, 2] > HALF_M + 0.5 * longer_m].mean() < 0.05
+    far = np.rint((np.array([0, 0, HALF_M + longer_m]) - grid.origin_m) / grid.voxel_m).astype(int)
+    np.testing.assert_allclose(grid.rgb[tuple(far)], [0, 1, 0], atol=0.01)
 
 
 def test_refinement_pulls_disturbed_poses_back(views):
