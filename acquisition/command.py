@@ -66,7 +66,9 @@ def _record(
     recorder = Recorder(setup.rig, setup.devices, clock)
     with contextlib.ExitStack() as open_things:
         if setup.lab is not None and args.calibration:
-            setup.lab.stage.set_up(setup.lab.show.board_views(progress_for("preparing the simulated lab")))
+            show = setup.lab.show
+            views = show.hand_eye_views if args.calibration == "hand-eye" else show.board_views
+            setup.lab.stage.set_up(views(progress_for("preparing the simulated lab")))
         elif setup.lab is not None:
             setup.thrower.prepare(first, 0, progress_for("preparing the simulated lab"))
         open_things.enter_context(recorder)

@@ -15,8 +15,8 @@ from dataclasses import dataclass, field
 from typing import Generic, Literal, TypeVar
 
 T = TypeVar("T")
-READS, WRITES = -10, -5
-"""How nice the threads that read devices are to other programs, and those that encode and write."""
+LOOPS, READS, WRITES = -15, -10, -5
+"""How nice to other programs are: control loops of arms, threads that read devices, those that encode and write."""
 Cause = Literal["queue full", "duplicate", "out of order", "invalid", "write failed", "too late"]
 
 

@@ -32,6 +32,7 @@ CELLS = 3
 STILL_PX = 1.5
 NEW_PX = 40.0
 NEW_TURN_RAD = 0.17
+STANDS_RAD, STANDS_NS = 0.002, 10_000_000
 POLL_S = 0.3
 LONGEST_S = 1800.0
 FEWEST_POINTS = 8
@@ -41,6 +42,8 @@ FEWEST_POINTS = 8
 class Coverage:
     """Which parts of a camera's picture the board has been in, and how it was tilted."""
 
+    everywhere: bool = True
+    """The board has to be in all parts of the picture (lenses want that, hand-eye does not)."""
     views: int = 0
     cells: set[tuple[int, int]] = field(default_factory=set)
     tilts: set[str] = field(default_factory=set)
@@ -58,7 +61,7 @@ class Coverage:
             wanted.append(f"{PER_CAMERA - self.views} more views")
         rows, columns = ("top", "middle", "bottom"), ("left", "centre", "right")
         empty = [f"{rows[r]} {columns[c]}" for r in range(CELLS) for c in range(CELLS) if (r, c) not in self.cells]
-        if len(empty) > 3:
+        if self.everywhere and len(empty) > 3:
             wanted.append("the board at the " + ", ".join(empty[:3]))
         if len(self.tilts) < 3:
             wanted.append("other tilts than " + ", ".join(sorted(self.tilts) or ["none"]))
@@ -90,16 +93,18 @@ def record_views(
     """Views until there are enough, or the stop key. Each holds one image of every camera, a second apart."""
     target = the_board(setup)
     report = SessionReport(session.folder, 0)
-    covered = {d.name: Coverage() for d in setup.rig.devices if d.kind in ("rgbd", "mono")}
+    kinds = ("rgbd",) if kind == "hand-eye" else ("rgbd", "mono")
+    covered = {d.name: Coverage(kind == "board") for d in setup.rig.devices if d.kind in kinds}
     operator.say(f"show the board ({kind}); hold it still for each view. x: enough")
     last: dict[str, TargetView] = {}
     kept: list[dict[str, TargetView]] = []
     poses: list[Float[Array, " j"]] = []
+    before: Float[Array, " j"] | None = None
     ends = time.monotonic() + LONGEST_S
     with interrupts.shield():
         writer = session.calibration_views()
     if setup.lab is not None:
-        setup.lab.stage.begin()
+        setup.lab.show_views()
     try:
         while len(kept) < ENOUGH[kind] or any(c.missing() for c in covered.values()):
             time.sleep(POLL_S)
@@ -112,6 +117,8 @@ def record_views(
             still = bool(seen) and all(n in last and _moved_px(seen[n], last[n]) < STILL_PX for n in seen)
             last = seen
             q = recorder.joints_at(time.monotonic_ns())
+            still = still and _stands(q, before)
+            before = q
             if not still or not _new(kind, seen, kept, q, poses):
                 continue
             with interrupts.shield():
@@ -184,6 +191,11 @@ def _moved_px(a: TargetView, b: TargetView) -> float:
     return float(np.median(np.linalg.norm(a.pixels[at_a] - b.pixels[at_b], axis=1)))
 
 
+def _stands(q: Float[Array, " j"] | None, before: Float[Array, " j"] | None) -> bool:
+    """Whether the arm, where there is one, stands where it stood a moment ago."""
+    return q is None or (before is not None and float(np.abs(q - before).max()) < STANDS_RAD)
+
+
 def _new(
     kind: Kind,
     seen: Mapping[str, TargetView],
@@ -224,6 +236,6 @@ def _write(
             writer.mono(EncodedImage(name, number, time_ns, time_ns, "png", width, height, data))
     arm = next((d for d in recorder.devices.values() if hasattr(d, "joint_names")), None)
     if q is not None and arm is not None:
-        none = np.full(1, np.nan)
-        states = ArmStates(np.array([time_ns]), tuple(arm.joint_names), q[None], np.zeros_like(q)[None], none)
-        writer.arm(states)
+        times_ns = time_ns + STANDS_NS * np.arange(-1, 2)  # the arm stands: a reader finds it before and after the view
+        q = np.tile(q, (3, 1))
+        writer.arm(ArmStates(times_ns, tuple(arm.joint_names), q, np.zeros_like(q), np.full(3, np.nan)))

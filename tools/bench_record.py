@@ -137,8 +137,9 @@ def bench_rates(seconds: float) -> bool:
             good &= unaccounted == 0 and same
             fullest, held = recorder.lanes[topic].fullest, counts.get(topic, 0)
             print(
-                f"  {topic:<20} received {tally.received:>6} written {tally.written:>6} in file {held:>6} "
-                f"dropped {tally.dropped_total:>4} missed {tally.missed:>4} unaccounted {unaccounted} queue {fullest}"
+                f"  {topic:<20} received {whole.received:>6} = written {whole.written:>6} + dropped "
+                f"{whole.dropped_total:>4} + before and after {whole.idle:>5} + unaccounted {unaccounted}; "
+                f"in file {held:>6}, missed {whole.missed}, fullest queue {fullest}"
             )
         for name, clock in clocks.items():
             print(f"  clock {name}: sigma {1e3 * clock['sigma_s']:.4f} ms, drift {1e6 * clock['drift']:+.2f} ppm")

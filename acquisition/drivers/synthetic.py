@@ -116,6 +116,14 @@ class SyntheticLab:
         self._faults: dict[str, Faults] = {}
         self._opened: set[str] = set()
 
+    def show_views(self) -> None:
+        """Play the views of the board that were set up, the arm going from one to the next."""
+        ready = self.stage.ready
+        trajectory = getattr(ready.motion.swing, "trajectory", None) if ready is not None else None
+        if trajectory is None:
+            raise RuntimeError("no views were set up")
+        self.arm.move(trajectory)
+
     def faults(self, device: str) -> Faults:
         """The faults of a device, to inject some."""
         return self._faults.setdefault(device, Faults(FAULTS))

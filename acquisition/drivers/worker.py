@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from acquisition.devices import DeviceLost
+from acquisition.streams import LOOPS, go_first
 
 _HEAD = struct.Struct("<cI")
 STDERR_LINES = 20
@@ -128,6 +129,7 @@ class WorkerEnd:
         self._waiting = bytearray()
         self._in = 0
         self._writing = threading.Lock()
+        go_first(LOOPS)
         gc.disable()  # no pauses in a 1 kHz loop; nothing here makes cycles
 
     def emit(self, kind: bytes, payload: bytes) -> None:

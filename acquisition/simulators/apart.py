@@ -15,6 +15,7 @@ import subprocess
 import sys
 from typing import Any, Protocol, runtime_checkable
 
+from acquisition.streams import LOOPS, go_first
 from recordings.errors import TosslabError
 
 SIMULATORS = {"fci": "acquisition.simulators.fci:FciServer", "rtde": "acquisition.simulators.rtde:UrServer"}
@@ -88,7 +89,11 @@ class Apart:
 
 
 def serve(name: str, options: dict[str, Any]) -> None:
-    """Run the simulator in this process and obey the lines on standard input until it closes."""
+    """Run the simulator in this process and obey the lines on standard input until it closes.
+
+    It goes before other programs: a real device has a machine of its own.
+    """
+    go_first(LOOPS)
     module, _, class_name = SIMULATORS[name].partition(":")
     try:
         simulator: Simulator = getattr(importlib.import_module(module), class_name)(**options)

@@ -6,7 +6,7 @@ With `pictures = "pool"` nothing is rendered: noisy pictures of the right size i
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -17,7 +17,7 @@ from numpy import ndarray as Array
 
 from acquisition.devices import JointTrajectory
 from acquisition.synthetic.arm import FORWARD_S, OPEN_M, READY_RAD, Swing
-from acquisition.synthetic.board import board_pose
+from acquisition.synthetic.board import board_pose, held_board_poses
 from acquisition.synthetic.cameras import MONO_NAMES
 from acquisition.synthetic.chance import BOARD, generator
 from acquisition.synthetic.config import (
@@ -47,6 +47,8 @@ STILL_RAYS = 700_000
 POOL = 6
 VIEW_S = 3.0
 """How long the board is held in one place."""
+GOES_S = 0.15
+"""Half the time that the arm needs from one view to the next."""
 SAMPLES_HZ = 1000
 
 
@@ -178,10 +180,9 @@ class Show:
 
     def _standing(self, plan: TossPlan) -> Performance:
         """The pool's pictures, in turn."""
-        motion = _still_motion(plan.trajectory.q_rad[[0, -1]])
-        assert isinstance(motion.swing, CommandedSwing)
-        motion = replace(motion, swing=replace(motion.swing, trajectory=plan.trajectory))
-        return Performance(motion, {name: Reel(np.zeros(0), [], p, p) for name, p in self._pool.items()})
+        return Performance(
+            _standing_motion(plan.trajectory), {name: Reel(np.zeros(0), [], p, p) for name, p in self._pool.items()}
+        )
 
     @cached_property
     def _pool(self) -> dict[str, list[Array]]:
@@ -213,20 +214,34 @@ class Show:
 
     def board_views(self, progress: Progress) -> Performance:
         """The calibration board, held still in one place after the other, seen by all cameras."""
-        rng, count = generator(self.config.seed, BOARD), self.config.board_views
+        rng = generator(self.config.seed, BOARD)
+        return self._views([board_pose(rng) for _ in range(self.config.board_views)], None, progress)
+
+    def hand_eye_views(self, progress: Progress) -> Performance:
+        """The board in the arm's hand, in one pose of the arm after the other. The arm itself is not drawn."""
+        assert self.lab.arm is not None
+        base = self.lab.arm.world_from_base
+        world_from_base = Transform("world", "base", base.rotation, base.translation_m)
+        rng = generator(self.config.seed, BOARD)
+        _, held = held_board_poses(world_from_base, self.lab.world_from_d455, self.config.board_views, rng)
+        times_s = np.array([VIEW_S * k + at for k in range(len(held)) for at in (GOES_S, VIEW_S - GOES_S)])
+        q = np.repeat([one.q_rad for one in held], 2, axis=0)
+        stops = JointTrajectory(times_s, q, np.zeros_like(q))
+        return self._views([one.world_from_board for one in held], stops, progress)
+
+    def _views(self, poses: list[Transform], arm: JointTrajectory | None, progress: Progress) -> Performance:
         pictures: dict[str, list[Array]] = {name: [] for name in self.phases_s()}
         frames = round(VIEW_S * self.config.fps)
-        for number in range(count):
-            color, depth, monos = self.lab.board_view(number, board_pose(rng))
+        for number, world_from_board in enumerate(poses):
+            color, depth, monos = self.lab.board_view(number, world_from_board)
             shown = {"d455/color": color, "d455/depth": depth, **dict(zip(MONO_NAMES, monos))}
             for name, reel in pictures.items():
                 reel += [_stirred(shown[name], k) for k in range(2)] * (frames // 2)
-            progress.step(number + 1, count, "views of the board")
-        motion = _still_motion(np.stack([READY_RAD, READY_RAD]))
+            progress.step(number + 1, len(poses), "views of the board")
         times_s = np.arange(len(pictures["d455/color"])) / self.config.fps
         phases_s = self.phases_s()
         reels = {n: Reel(times_s + phases_s[n], p, p[:2], p[-2:]) for n, p in pictures.items()}
-        return Performance(motion, reels)
+        return Performance(_standing_motion(arm), reels)
 
     def is_of(self, performance: Performance, trajectory: JointTrajectory) -> bool:
         """Whether a performance was made for this trajectory."""
@@ -275,10 +290,12 @@ def _stirred(picture: Array, variant: int) -> Array:
     return other
 
 
-def _still_motion(q: Float[Array, "2 j"]) -> Motion:
-    """Nothing moves."""
-    stand = JointTrajectory(np.array([0.0, 2.0]), q, np.zeros_like(q))
-    swing = CommandedSwing(1.0, q[0], np.zeros(7), np.zeros(7), FORWARD_S, 0.04, 0.05, stand)
+def _standing_motion(trajectory: JointTrajectory | None) -> Motion:
+    """The object stays where it is, whatever the arm does (None: it stands)."""
+    if trajectory is None:
+        q = np.stack([READY_RAD, READY_RAD])
+        trajectory = JointTrajectory(np.array([0.0, 2.0]), q, np.zeros_like(q))
+    swing = CommandedSwing(1.0, trajectory.q_rad[0], np.zeros(7), np.zeros(7), FORWARD_S, 0.04, 0.05, trajectory)
     still = Trajectory(
         np.array([0.0, 1.0]),
         np.zeros((2, 3)),

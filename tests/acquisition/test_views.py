@@ -8,9 +8,13 @@ import numpy as np
 import pytest
 
 from acquisition.cli import main
+from acquisition.setup import set_up
 from acquisition.views import PER_CAMERA, Coverage, progress_text, tilt_of
+from calibration.cli import main as calibrate
 from calibration.targets import TargetView
+from recordings.geometry import Transform
 from recordings.session import Session, Toss
+from recordings.tracks import RigCalibration
 
 RIG = """name = "views"
 robot = "panda"
@@ -79,3 +83,19 @@ def test_views_of_the_simulated_board_are_recorded_and_what_is_missing_is_said(
     with Toss(out / "calibration.mcap") as views:
         assert 2 <= len(views.color()) <= 3
         assert len(views.mono("mono0")) == len(views.color())
+
+
+@pytest.mark.slow
+def test_the_simulated_arm_s_views_find_its_base(tmp_path: Path) -> None:
+    rig, out = tmp_path / "rig.toml", tmp_path / "out"
+    rig.write_text(RIG.replace("board_views = 3", "board_views = 12"))
+    assert main(["--rig", str(rig), "--calibration", "hand-eye", "--yes", str(out)]) == 1  # fewer than 20
+    assert calibrate(["hand-eye", str(out)]) == 0
+    lab = set_up(str(rig)).lab
+    assert lab is not None
+    assert lab.show.lab.arm is not None
+    base, d455 = lab.show.lab.arm.world_from_base, lab.show.lab.world_from_d455
+    d455_from_base = d455.inverse() @ Transform("world", "base", base.rotation, base.translation_m)
+    found = RigCalibration.read(out / "calibration.json").transform("d455", "base")
+    np.testing.assert_allclose(found.translation_m, d455_from_base.translation_m, atol=4e-3)
+    np.testing.assert_allclose(found.rotation, d455_from_base.rotation, atol=4e-3)
