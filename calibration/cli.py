@@ -57,6 +57,9 @@ def _intrinsics(commands: Any) -> None:
     )
     parser.add_argument("--camera", action="append", help="only this camera (may be given again)")
     parser.add_argument(
+        "--anew", action="store_true", help="take the fitted lens even where the given one explains the views as well"
+    )
+    parser.add_argument(
         "--lens",
         action="append",
         choices=("none", "brown-conrady", "rational", "fisheye"),

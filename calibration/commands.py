@@ -68,7 +68,9 @@ def intrinsics(path: Path, args: argparse.Namespace, progress: Progress) -> Done
         lenses: dict[str, Lens] = {}
         for name in wanted:
             given = session.calibration.cameras.get(name)
-            lenses[name] = calibrate_intrinsics(name, views.sizes[name], views.board[name], args.lens or LENSES, given)
+            lenses[name] = calibrate_intrinsics(
+                name, views.sizes[name], views.board[name], args.lens or LENSES, given, args.anew or bool(args.lens)
+            )
         reports = [replace(lens.report, kind=f"intrinsics of {name}") for name, lens in lenses.items()]
         picture = _picture(session, "intrinsics", views, lenses)
         if args.dry_run or any(r.verdict == "refused" for r in reports):

@@ -31,6 +31,8 @@ GOOD_DEG, WORST_DEG = 0.1, 0.5
 OUTLIER_VIEW = 3.0
 """A camera's view whose rms is this many times its camera's median is left out."""
 FOLDS = 4
+AS_GOOD = 1.02
+"""Given lenses are kept unless their hold-out error is this many times that of freed ones."""
 UNDETERMINED = 1e-9
 BOARD, TABLE = 0, 1
 TABLE_PX = 0.8
@@ -63,19 +65,27 @@ def calibrate_cameras(
     `table`: what the same images show of tags fixed to the table (points in the world). They span more than a board
     does, so they give the scale, and the board's own is found: a printer is off by a part in a thousand easily. Tags
     that do not lie where they are said to are left out, and the report says so. `lenses_free`: the lenses are solved
-    with the places, from the given ones; `models` of the result holds them.
+    with the places, and taken where they explain views kept aside better than the given ones do; `models` of the result
+    holds them.
     Raises BadInput where the geometry does not connect the cameras, naming those that are cut off.
     """
     names = [reference, *sorted(n for n in models if n != reference)]
     setup = _Setup(names, models, views, _still(names, table))
     findings, setup = _table_or_not(setup)
     solved, seen, dropped = _without_bad_views(setup.start, setup.observations(setup.start))
+    hold_out = _hold_out(setup, solved)
     if lenses_free:
-        solved = adjust(replace(solved.scene, free_lenses=np.ones(len(names), dtype=bool)), seen)
+        freed = adjust(replace(solved.scene, free_lenses=np.ones(len(names), dtype=bool)), seen)
+        freed_hold_out = _hold_out(setup, freed)
+        given_px, freed_px = hold_out["rms_px"], freed_hold_out["rms_px"]
+        if given_px > AS_GOOD * freed_px:
+            solved, hold_out = freed, freed_hold_out
+        else:
+            text = f"the given lenses explain views kept aside as well ({given_px:.4f} px) as freed ones"
+            findings.append(Finding("note", f"{text} ({freed_px:.4f} px): kept"))
     findings += _judge(names, solved, seen)
     if dropped:
         findings.append(Finding("note", f"left out for their residuals: {', '.join(_named(setup, dropped))}"))
-    hold_out = _hold_out(setup, solved)
     findings += limit(hold_out["rms_px"], "the residual on views kept aside", "px", GOOD_PX, WORST_PX)
     figures = per_camera(names, solved, seen)
     report = Report(
@@ -345,7 +355,7 @@ def _hold_out(setup: _Setup, full: Solved) -> dict[str, float]:
         moves_mm += [1e3 * float(np.linalg.norm(m[:3, 3])) for m in moved[1:]]
         turns_deg += [angle_deg(m[:3, :3]) for m in moved[1:]]
         fixed = np.zeros(len(setup.names), dtype=bool)
-        scene = replace(rest.scene, free_cameras=fixed, free_scales=np.zeros(2, dtype=bool))
+        scene = replace(rest.scene, free_cameras=fixed, free_lenses=fixed, free_scales=np.zeros(2, dtype=bool))
         kept = replace(scene, free_views=full.scene.free_views & aside)
         seen = replace(setup, still={}).observations(kept)
         if len(seen):

@@ -17,7 +17,7 @@ from jaxtyping import Float
 from numpy import ndarray as Array
 
 from calibration.bundle import Observations, Scene, Solved, adjust, lens_numbers, with_lens
-from calibration.extrinsics import LEAST_POINTS, bad_views, board_pose, whitening
+from calibration.extrinsics import AS_GOOD, LEAST_POINTS, bad_views, board_pose, whitening
 from calibration.report import Finding, Report, limit
 from calibration.targets import TargetView
 from recordings.errors import BadInput
@@ -54,8 +54,10 @@ def calibrate_intrinsics(
     views: Sequence[TargetView],
     lens_models: Sequence[DistortionModel] = ("none", "brown-conrady", "rational"),
     given: CameraModel | None = None,
+    anew: bool = False,
 ) -> Lens:
-    """`size`: width and height. `given`: what the camera is said to be (a start, and judged against the result).
+    """`size`: width and height. `given`: what the camera is said to be (a start, and judged against the result); it is
+    kept where it explains the views as well as a fitted lens, unless `anew`.
 
     Raises BadInput where there are too few views to try.
     """
@@ -69,6 +71,10 @@ def calibrate_intrinsics(
     fits = {kind: _Fit.of(_bare(first, kind), used) for kind in lens_models}
     kind = _simplest(fits)
     fit = fits[kind]
+    if given is not None and not anew and (given.width, given.height) == size:
+        kept = _kept(camera, given, fit, used)
+        if kept is not None:
+            return kept
     findings = [*_judge(camera, fit, used, size), *_against_given(camera, given, fit.model)]
     report = Report(
         "intrinsics",
@@ -79,6 +85,27 @@ def calibrate_intrinsics(
         {"lens": kind, "coverage": coverage(fit.seen.pixels, size), "rejected_views": sorted(fit.rejected)},
     )
     return Lens(fit.model, report, fit.solved.residual_px, fit.seen.pixels)
+
+
+def _kept(camera: str, given: CameraModel, fit: _Fit, views: Sequence[TargetView]) -> Lens | None:
+    """The given lens, where it explains the views as well as the fitted one does views that it has not seen: few views,
+    or views of the image's middle only, know a lens less well than its maker."""
+    solved, seen = _solve(given, views, [v for v in range(len(views)) if v not in fit.rejected], free_lens=False)
+    if solved.rms_px > AS_GOOD * fit.hold_out_px:
+        return None
+    text = (
+        f"{camera}: the given lens explains the views as well ({solved.rms_px:.4f} px) as one fitted to them does "
+        f"views kept aside ({fit.hold_out_px:.4f} px): kept; `--anew` takes the fitted one"
+    )
+    report = Report(
+        "intrinsics",
+        {"rms_px": solved.rms_px, "views": len(np.unique(seen.view)), "points": len(seen)},
+        {"rms_px": solved.rms_px, "fitted_rms_px": fit.hold_out_px},
+        {f"fitted_{name}": value for name, value in _uncertainty(fit).items()},
+        (Finding("note", text), *limit(solved.rms_px, f"{camera}'s residual", "px", GOOD_PX, WORST_PX)),
+        {"lens": "given", "rejected_views": sorted(fit.rejected)},
+    )
+    return Lens(given, report, solved.residual_px, seen.pixels)
 
 
 def coverage(pixels: Float[Array, "n 2"], size: tuple[int, int]) -> float:

@@ -150,6 +150,21 @@ def test_a_view_with_wrong_corners_is_left_out_of_the_lens(geometry):
     assert lens.model.fx == pytest.approx(model.fx, rel=4e-3)
 
 
+def test_a_given_lens_is_kept_until_the_views_know_better(geometry):
+    rng = np.random.default_rng(9)
+    true = geometry.camera("mono0")
+    views = [geometry.view(true, geometry.tilted(rng, (0.7, 0.9), 0.05), rng) for _ in range(6)]
+    kept = calibrate_intrinsics("mono0", (640, 480), views, ("none",), true)
+    assert kept.model is true
+    assert kept.report.verdict == "good"
+    assert "--anew" in " ".join(kept.report.reasons())
+    anew = calibrate_intrinsics("mono0", (640, 480), views, ("none",), true, anew=True)
+    assert anew.model is not true
+    wrong = replace(true, K=true.K * [[1.06, 1, 1], [1, 1.06, 1], [1, 1, 1]])
+    found = calibrate_intrinsics("mono0", (640, 480), views, ("none",), wrong)
+    assert abs(found.model.fx / true.fx - 1) < 0.02
+
+
 @pytest.mark.parametrize("alpha", [0.0, 1.0])
 def test_a_matrix_of_get_optimal_new_camera_matrix_with_its_distortion_kept_is_recognised(geometry, alpha):
     true = geometry.camera("mono0", 620.0, distortion_model="brown-conrady", distortion=(-0.25, 0.08, 0.0, 0.0, 0.0))
