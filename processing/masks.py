@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 def static_scene(run: Run) -> Done:
     """Stage `scene`: what the camera sees without the object, from frames of all tosses of the run."""
     inputs = {name: run.keys[name] for name in ("calibration", *(f"toss_{t:02d}" for t in run.recorded))}
-    return run.store.run("scene", 3, run.config.scene, inputs, lambda folder: _learn_scene(run, folder))
+    return run.store.run("scene", 4, run.config.scene, inputs, lambda folder: _learn_scene(run, folder))
 
 
 def _learn_scene(run: Run, folder: Path) -> Counts:

@@ -13,7 +13,7 @@ from processing.segment.foreground import (
     ForegroundSettings,
     evidence,
     fill_holes,
-    kernel,
+    grown,
     moved_pixels,
     nearer_than_scene,
     refine_border,
@@ -126,23 +126,24 @@ def follow(
     expected = _shifted(memory.mask, shift)
     area = int(memory.mask.sum())
     reach = int(0.6 * np.sqrt(area)) * (memory.missed + 1) + 4
-    near = cv2.dilate(expected.astype(np.uint8), kernel(min(reach, 150))) > 0
+    near = grown(expected, min(reach, 150))
     moved = moved_pixels(frame, scene, s.foreground)
-    likeness = memory.likeness.log_odds(frame.color_rgb)
-    moved &= scene.known | nearer_than_scene(frame.depth_m, scene, s.foreground) | (likeness > 0)
+    if (moved & ~scene.known).any():
+        alike = memory.likeness.log_odds(frame.color_rgb) > 0
+        moved &= scene.known | nearer_than_scene(frame.depth_m, scene, s.foreground) | alike
     if block is not None:
         moved &= ~block
     rough = component_in(moved, near)
     if beside is not None:
         rough |= _other_pieces(frame, moved & ~rough, expected, beside, memory, s)
-    others = moved & near & ~(cv2.dilate(rough.astype(np.uint8), kernel(3)) > 0)
+    others = moved & near & ~grown(rough, 3)
     others_px = int(others.sum())
     if rough.sum() < s.least_px:
         return Found(np.zeros_like(rough), 0.0, others_px, False)
-    wide = cv2.dilate(rough.astype(np.uint8), kernel(5)) > 0
+    wide = grown(rough, 5)
     strange = (wide & (~scene.known if beside is None else beside.unknown)).sum() > s.unknown * rough.sum()
-    grown = rough.sum() > s.grown * area
-    if strange or (grown and not _is_all_object(frame, rough, expected, memory, s)):
+    larger = rough.sum() > s.grown * area
+    if strange or (larger and not _is_all_object(frame, rough, expected, memory, s)):
         rough = _among_others(frame, scene, moved, expected, memory, beside, s)
         if rough.sum() < s.least_px:
             return Found(np.zeros_like(rough), 0.0, others_px, True)
@@ -156,7 +157,7 @@ def follow(
         mask = mask & ~block
     ratio = min(mask.sum(), area) / max(mask.sum(), area, 1)
     others_near = others_px > s.least_px or int((moved & near & ~mask).sum()) > 3 * s.least_px
-    largest = _largest_other(moved & ~(cv2.dilate(mask.astype(np.uint8), kernel(9)) > 0), s)
+    largest = _largest_other(moved & ~grown(mask, 9), s)
     return Found(mask, float(np.clip(sure * min(1.0, ratio / 0.7), 0, 1)), others_px, others_near, largest)
 
 
@@ -215,7 +216,7 @@ def _other_pieces(
     if corners is None:
         return out
     hull = cv2.fillConvexPoly(np.zeros(expected.shape, np.uint8), cv2.convexHull(corners), 1)
-    whole = cv2.dilate(hull, kernel(s.piece_reach_px)) > 0
+    whole = grown(hull > 0, s.piece_reach_px)
     count, labels, stats, _ = cv2.connectedComponentsWithStats(moved.astype(np.uint8), connectivity=4)
     low, high = memory.depth_range_m
     for k in range(1, count):

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
 from numpy import ndarray as Array
 
-from processing.segment.foreground import kernel
+from processing.segment.foreground import grown, kernel
 
 BINS = 16
 UNSEEN = 2e-3
@@ -64,7 +64,7 @@ class Likeness:
 
 def color_shares(color_rgb: UInt8[Array, "h w 3"], mask: Bool[Array, "h w"]) -> Float[Array, " b"]:
     """How often each colour is seen inside a mask."""
-    return _shares(_cells(color_rgb)[mask])
+    return _shares(_cells(color_rgb[mask]))
 
 
 def shares_log_odds(
@@ -75,7 +75,7 @@ def shares_log_odds(
     return cv2.blur(table.astype(np.float32)[_cells(color_rgb)], (3, 3))
 
 
-def _cells(color_rgb: UInt8[Array, "h w 3"]) -> Int[Array, "h w"]:
+def _cells(color_rgb: UInt8[Array, "*n 3"]) -> Int[Array, "*n"]:
     c = (color_rgb // (256 // BINS)).astype(np.int32)
     return (c[..., 0] * BINS + c[..., 1]) * BINS + c[..., 2]
 
@@ -86,9 +86,8 @@ def _histograms(color_rgb: UInt8[Array, "h w 3"], mask: Bool[Array, "h w"]) -> t
     part = mask.astype(np.uint8)
     core, near = cv2.erode(part, kernel(2)) > 0, cv2.dilate(part, kernel(3)) > 0
     core = core if core.sum() > 30 else mask
-    ring = (cv2.dilate(part, kernel(reach)) > 0) & ~near
-    cells = _cells(color_rgb)
-    return _shares(cells[core]), _shares(cells[ring])
+    ring = grown(mask, reach) & ~near
+    return color_shares(color_rgb, core), color_shares(color_rgb, ring)
 
 
 def _shares(cells: Int[Array, " n"]) -> Float[Array, " b"]:

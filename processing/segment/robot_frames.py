@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 from numpy import ndarray as Array
 
-from processing.segment.foreground import kernel
+from processing.segment.foreground import grown, kernel
 from processing.segment.likeness import Likeness, color_shares, shares_log_odds
 from processing.segment.robot_view import RobotView
 from processing.segment.static_scene import StaticScene, stereo_sigma_m
@@ -196,8 +196,7 @@ def robot_likeness(
     frame: RgbdFrame, seen: RobotSeen, likeness: Likeness, shares: Float[Array, " b"], s: RobotSettings
 ) -> Float32[Array, "h w"]:
     """log(P(colour | object) / P(colour | robot)) at and near the drawn robot, 0 elsewhere."""
-    at = ((seen.at_color_m > 0) | (seen.depth_m > 0)).astype(np.uint8)
-    near = cv2.dilate(at, kernel(s.near_px)) > 0
+    near = grown((seen.at_color_m > 0) | (seen.depth_m > 0), s.near_px)
     if len(shares) == 0:
         return np.zeros(near.shape, dtype=np.float32)
     odds = shares_log_odds(frame.color_rgb, likeness.object_shares, shares)
