@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import select
 import sys
 import time
@@ -77,11 +78,27 @@ class Keyboard(Nobody):
 
     headless = False
 
+    def __init__(self, out: TextIO | None = None) -> None:
+        super().__init__(out)
+        self._typed = ""
+        """Read from stdin and not looked at yet."""
+        self._closed = False
+
     def key(self) -> Key | None:
-        if not select.select([sys.stdin], [], [], 0)[0]:
-            return None
-        pressed = sys.stdin.read(1) if sys.stdin.isatty() else sys.stdin.readline().strip()[:1]
-        return KEYS.get(pressed.lower()) if pressed else "quit"
+        self._listen(0.0)
+        if not self._typed:
+            return "quit" if self._closed else None
+        pressed = self._typed[0]
+        length = 1 if sys.stdin.isatty() else (self._typed + "\n").index("\n") + 1
+        self._typed = self._typed[length:]
+        return KEYS.get(pressed.lower())
+
+    def _listen(self, seconds: float) -> None:
+        """Past Python's own buffer, which `select` cannot see into."""
+        if not self._closed and select.select([sys.stdin], [], [], seconds)[0]:
+            read = os.read(sys.stdin.fileno(), 1024)
+            self._typed += read.decode(errors="replace")
+            self._closed = not read
 
     def wait_for_start(self) -> Key:
         self.say("s: start   q: quit")
@@ -97,7 +114,10 @@ class Keyboard(Nobody):
     def note(self) -> str:
         self.say("note, then Enter:")
         with _lines(sys.stdin):
-            return sys.stdin.readline().strip()
+            while "\n" not in self._typed and not self._closed:
+                self._listen(POLL_S)
+        line, _, self._typed = self._typed.partition("\n")
+        return line.strip()
 
     def _wait(self, wanted: tuple[Key, ...]) -> Key:
         while True:
