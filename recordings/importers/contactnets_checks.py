@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -60,6 +60,7 @@ def check_all(tosses: Mapping[int, States], dt_s: float, warnings: Warnings) -> 
     )
     _judge_step(checks.step_ratio, dt_s, warnings)
     _judge_spin(checks, warnings)
+    _judge_velocity(all_of, dt_s, warnings)
     sideways = _median([np.linalg.norm(_first_accelerations(t, dt_s)[:, :2], axis=1) for t in all_of])
     _judge_fall(checks.fall_m_s2, sideways, warnings)
     return checks
@@ -146,10 +147,42 @@ def _judge_spin(checks: Checks, warnings: Warnings) -> None:
         raise BadInput(
             "the quaternions fit the spins when read as x y z w; wanted files with w x y z, as the format says"
         )
+    world = checks.spin_mismatch_world_rad_s
+    if world is not None and world < here / 3:
+        warnings.add(
+            "the spins fit the quaternions when read in the world frame; the format wants them in the object frame. "
+            "Poses are kept as they are, velocities are made from them"
+        )
+        return
     warnings.add(
         f"spins and quaternions disagree (median {here:.2g} rad/s): is the spin in another frame? Poses are "
         "kept as they are"
     )
+
+
+def _judge_velocity(tosses: Iterable[States], dt_s: float, warnings: Warnings) -> None:
+    """Linear velocities belong to the world; in the object frame they have the right length and a wrong direction."""
+    gaps = [_velocity_gaps(t, dt_s) for t in tosses]
+    world, object_ = _median([g[0] for g in gaps]), _median([g[1] for g in gaps])
+    if world is None or object_ is None or world < MOVING_M_S:
+        return
+    if object_ < world / 3:
+        warnings.add(
+            "the linear velocities fit the positions when read in the object frame; the format wants them in the world "
+            "frame. Poses are kept as they are, velocities are made from them"
+        )
+        return
+    warnings.add(f"linear velocities and positions disagree (median {world:.2g} m/s): are they in another frame?")
+
+
+def _velocity_gaps(toss: States, dt_s: float) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+    """|stored velocity - difference of positions|, m/s, read in the world and in the object frame, for moving steps."""
+    moved, stored = np.diff(toss.position_m, axis=0) / dt_s, toss.velocity_m_s[1:]
+    q = toss.quaternion_wxyz[1:]
+    pure = np.hstack([np.zeros((len(stored), 1)), stored])
+    turned = _product(_product(q, pure), q * [1, -1, -1, -1])[:, 1:]
+    fast = np.linalg.norm(stored, axis=1) > MOVING_M_S
+    return np.linalg.norm(stored - moved, axis=1)[fast], np.linalg.norm(turned - moved, axis=1)[fast]
 
 
 def _judge_fall(fall: float | None, sideways: float | None, warnings: Warnings) -> None:

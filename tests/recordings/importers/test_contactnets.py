@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from recordings.errors import BadInput
 from recordings.importers.contactnets import import_contactnets
@@ -157,6 +158,24 @@ def test_quaternions_in_another_order_are_refused(tosses, tmp_path):
         save_contactnets(tosses / "tosses_processed" / f"{number}.pt", toss)
     with pytest.raises(BadInput, match="read as x y z w"):
         import_contactnets(tosses, tmp_path / "session")
+
+
+@pytest.mark.parametrize(
+    "column, change, words",
+    [
+        ("w", lambda toss, turn: turn.apply(toss["w"]), "spins fit the quaternions when read in the world frame"),
+        ("v", lambda toss, turn: turn.inv().apply(toss["v"]), "velocities fit the positions when read in the object"),
+    ],
+)
+def test_velocities_in_another_frame_are_named(tmp_path, column, change, words):
+    folder = tmp_path / "data" / "tosses_processed"
+    folder.mkdir(parents=True)
+    for number in range(3):
+        toss = flight(number)
+        turn = Rotation.from_quat(toss["q"][:, [1, 2, 3, 0]])
+        save_contactnets(folder / f"{number}.pt", toss | {column: change(toss, turn)})
+    report = import_contactnets(folder, tmp_path / "out", scale_m=SCALE, dt_s=DT)
+    assert any(words in w for w in report.warnings)
 
 
 @pytest.mark.parametrize(
