@@ -41,6 +41,8 @@ from recordings.session_writer import write_json, write_truth
 from recordings.sync import clock_offset_ns
 
 TRUTH = "truth"
+LATE_S = 0.0007
+"""Mono stamps that are off by more are told: 1 ms is 2 mm and 0.7 degrees."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +106,21 @@ def find_truth(
         own = witness(session, truths, solved, config.limits, WitnessConfig(config.family), progress)
     notes = [*size_notes, *_witness_notes(truths, own)]
     verdict = judge(solved, sightings, spread_ns, notes, calibration)
-    return SessionTruth(solved, own.tosses if own is not None else truths, verdict, sizes, own)
+    if own is not None and (late := _late(own, session)):
+        verdict = replace(verdict, warnings=(*verdict.warnings, late))
+    final = {toss: t.without_guesses() for toss, t in (own.tosses if own is not None else truths).items()}
+    return SessionTruth(solved, final, verdict, sizes, own)
+
+
+def _late(own: Witness, session: Session) -> str | None:
+    """The stamps of the mono cameras, as the D455's view of the same motion has them."""
+    if abs(own.offset_s) <= max(LATE_S, 4 * own.offset_std_s):
+        return None
+    return (
+        f"the mono cameras' stamps are off by {1e3 * own.offset_s:.1f} +- {1e3 * own.offset_std_s:.1f} ms against the "
+        f"colour camera's, by the tags in its own images: run `toss-calibrate time {session.path}`, then this again "
+        "with --replace"
+    )
 
 
 def _witness_notes(truths: Mapping[int, TossTruth], own: Witness | None) -> list[str]:

@@ -20,7 +20,7 @@ from numpy import ndarray as Array
 from calibration.tags import TagDetection, detect_tags
 from groundtruth import se3
 from groundtruth.session_solve import Solved
-from groundtruth.toss_truth import TossTruth, TrackedLimits, statuses
+from groundtruth.toss_truth import MOMENT_S, TossTruth, TrackedLimits, statuses
 from recordings.codec import decode_image
 from recordings.geometry import CameraModel
 from recordings.progress import Progress
@@ -44,6 +44,10 @@ class WitnessConfig:
     """How far the D455 may stand from its place in the calibration (standard deviations)."""
     short_px: float = 0.5
     """How far edges may appear short (standard deviation)."""
+    late_s: float = 0.02
+    """How far the mono cameras' stamps may be off (standard deviation)."""
+    flip_rad: float = 0.15
+    """Where the turn is less sure than this, a single tag, with its two solutions, does not do."""
     least_tags: int = 12
     """Sightings at known poses below which nothing can be said of this camera."""
     huber: float = 2.0
@@ -56,13 +60,16 @@ class WitnessConfig:
 @dataclass(frozen=True, eq=False)
 class Witness:
     """`off_m`, `off_rad`: how far the D455 stands from its place in the calibration. `corner_px`: median distance of
-    its corners from where the mono cameras' poses put them, where those are sure."""
+    its corners from where the mono cameras' poses put them, where those are sure. `offset_s`: what is to be added to
+    the mono cameras' stamps so that the poses of moving frames meet the D455's view, and its standard deviation."""
 
     tosses: Mapping[int, TossTruth]
     off_m: float
     off_rad: float
     corner_px: float
     sightings: int
+    offset_s: float
+    offset_std_s: float
 
     @property
     def frames(self) -> int:
@@ -75,6 +82,8 @@ class Witness:
             "sightings_at_sure_poses": self.sightings,
             "camera_off_m": self.off_m,
             "camera_off_rad": self.off_rad,
+            "mono_offset_ms": 1e3 * self.offset_s,
+            "mono_offset_std_ms": 1e3 * self.offset_std_s,
         }
 
 
@@ -102,6 +111,8 @@ class _Place:
     camera_from_world: Float[Array, "4 4"]
     short_px: float
     noise: float
+    late_s: float
+    late_std_s: float
 
 
 def witness(
@@ -144,12 +155,13 @@ def by_sightings(
         corrected[toss] = _corrected(model, place, truth, mine, limits, config)
     off = se3.log((place.camera_from_world @ np.linalg.inv(camera_from_world))[None])[0]
     off_rad, off_m = (float(np.linalg.norm(part)) for part in np.split(off, 2))
-    return Witness(corrected, off_m, off_rad, left_px, sum(s.tags for s in sure))
+    seen_at_sure = sum(s.tags for s in sure)
+    return Witness(corrected, off_m, off_rad, left_px, seen_at_sure, -place.late_s, place.late_std_s)
 
 
 def _wanted(truth: TossTruth, config: WitnessConfig) -> list[int]:
     """Open frames, and some of the others."""
-    placed = np.array([s != "lost" for s in truth.status], dtype=bool)
+    placed = np.isfinite(truth.world_from_tagged).all(axis=(1, 2))
     sure = np.flatnonzero(placed & ~truth.open)
     some = sure[np.unique(np.linspace(0, len(sure) - 1, config.sure_frames).round().astype(int))] if len(sure) else sure
     return sorted({*np.flatnonzero(placed & truth.open).tolist(), *some.tolist()})
@@ -207,28 +219,37 @@ def _placed(
     truths: Mapping[int, TossTruth],
     config: WitnessConfig,
 ) -> tuple[_Place, float]:
-    """The camera's place (a twist on its left), how short edges appear, and the noise against what is stated: robust
-    Gauss-Newton over all corners at poses that are sure. Also the median distance that is left."""
-    poses = [truths[s.toss].world_from_tagged[s.frame] for s in sure]
-    world = np.concatenate([s.points_m @ p[:3, :3].T + p[:3, 3] for s, p in zip(sure, poses)])
+    """The camera's place (a twist on its left), how short edges appear, how late the poses come, and the noise against
+    what is stated: robust Gauss-Newton over all corners at poses that are sure. Also the median distance left."""
+    now = [truths[s.toss].world_from_tagged[s.frame] for s in sure]
+    then = [truths[s.toss].soon[s.frame] for s in sure]
+    world, soon = (
+        np.concatenate([s.points_m @ p[:3, :3].T + p[:3, 3] for s, p in zip(sure, poses)]) for poses in (now, then)
+    )
+    speed = np.nan_to_num((soon - world) / MOMENT_S)
     pixels, outwards = (np.concatenate([getattr(s, name) for s in sure]) for name in ("pixels", "outwards"))
     sigma = np.concatenate([s.sigma_px for s in sure])
-    prior = 1 / np.array([config.place_rad] * 3 + [config.place_m] * 3 + [config.short_px])
-    camera, off, noise = known, np.zeros(7), 1.0
+    prior = 1 / np.array([config.place_rad] * 3 + [config.place_m] * 3 + [config.short_px, config.late_s])
+    camera, off, noise, information = known, np.zeros(8), 1.0, np.eye(8)
     for _ in range(10):
-        inside = world @ camera[:3, :3].T + camera[:3, 3]
+        inside = (world + off[7] * speed) @ camera[:3, :3].T + camera[:3, 3]
         residual = model.project(inside) - pixels - off[6] * outwards
         size = np.linalg.norm(residual, axis=1) / sigma
         noise = max(1.0, float(np.median(size)) / 1.177)  # the median of a two-dimensional normal's length
         root = np.sqrt(np.minimum(1.0, config.huber / np.maximum(size / noise, 1e-9))) / (sigma * noise)
         arm = np.concatenate([-se3.skew(inside), np.broadcast_to(np.eye(3), (len(inside), 3, 3))], -1)
-        J = np.concatenate([_by_point(model, inside) @ arm, -outwards[..., None]], -1) * root[:, None, None]
+        by_point = _by_point(model, inside)
+        by_time = by_point @ (speed @ camera[:3, :3].T)[..., None]
+        J = np.concatenate([by_point @ arm, -outwards[..., None], by_time], -1) * root[:, None, None]
         off[:6] = se3.log((camera @ np.linalg.inv(known))[None])[0]
         information = np.einsum("nij,nik->jk", J, J) + np.diag(prior**2)
         step = np.linalg.solve(information, -np.einsum("nij,ni->j", J, residual * root[:, None]) - prior**2 * off)
         camera = se3.exp(step[None, :6])[0] @ camera
-        off[6] += step[6]
-    return _Place(camera, float(off[6]), noise), float(np.median(np.linalg.norm(residual, axis=1)))
+        off[6:] += step[6:]
+    late_std_s = float(np.sqrt(np.linalg.inv(information)[7, 7]))
+    return _Place(camera, float(off[6]), noise, float(off[7]), late_std_s), float(
+        np.median(np.linalg.norm(residual, axis=1))
+    )
 
 
 def _by_point(model: CameraModel, points: Float[Array, "n 3"]) -> Float[Array, "n 2 3"]:
@@ -277,6 +298,8 @@ def _fused(
 
     Unknown are a turn about the body's origin and a shift, both in the world: X = p + d + exp(w) R x.
     """
+    if seen.tags < 2 and np.sqrt(np.trace(covariance[:3, :3])) > config.flip_rad:
+        return None
     prior, sigma = np.linalg.inv(covariance), seen.sigma_px * place.noise
     pixels = seen.pixels + place.short_px * seen.outwards
     turned, shift, total = pose[:3, :3], pose[:3, 3], np.zeros(6)

@@ -67,7 +67,8 @@ def scene(toss_lab):
     guessed[open_] = moved(poses[open_], random, 0.004 / np.sqrt(3), np.radians(2) / np.sqrt(3))
     sigma = np.where(open_[:, None], [0.02] * 3 + [0.0025] * 3, [2e-4] * 3 + [5e-5] * 3)
     covariance = np.einsum("ni,ij->nij", sigma**2, np.eye(6))
-    truth = TossTruth(np.arange(24), guessed, covariance, statuses(covariance, LIMITS), open_, np.zeros(24, bool))
+    status = statuses(covariance, LIMITS)
+    truth = TossTruth(np.arange(24), guessed, covariance, status, open_, np.zeros(24, bool), guessed)
     return truth, poses, seen, known
 
 
