@@ -34,7 +34,9 @@ rate_hz = 50
 [recording]
 countdown_s = 0
 longest_toss_s = 1.5
-longest_gap_s = 3
+longest_gap_s = 10
+most_lost_share = 1.0
+redo_at_most = 1000
 queue_s = 4
 [simulation]
 pictures = "pool"
