@@ -14,11 +14,12 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray as Array
 from scipy.spatial.transform import Rotation
+from scipy.stats import t as student
 
-from processing.dynamics import contact_stage, held_out_loss_j, held_out_model
+from processing.dynamics import contact_stage, held_out_losses, held_out_model
 from processing.icp import ShapeSurface
 from processing.joint_stage import joint_stage
-from processing.judge import Explained, difference, explain, pooled
+from processing.judge import CHANCE, Explained, difference, explain, pooled
 from processing.second_pass import CycleConfig, align_stage, input_keys, second_field, second_tracks
 from processing.stage import Counts, Done
 from processing.vision import field_stage
@@ -153,22 +154,26 @@ def _joint(run: Run, start: Pass, name: str) -> Pass:
     return replace(ended, passes=(_told(run, begun, ended, start.masks, name),))
 
 
-EVIDENCE = ("depth_m", "mask", "color", "contact_j")
-"""What passes are compared by, each weighing the same: residuals on the raw images (judge.py), and the contact loss of
-tosses from which nothing of contact was learned."""
+def certain_share(before: Mapping[int, float], after: Mapping[int, float]) -> float:
+    """By how much the mean over tosses is larger afterwards, as a share; 0 where chance makes such a difference between
+    so few tosses (t-test on pairs): a loss that hangs on some corners hitting the table is a rough judge."""
+    both = [t for t in before if t in after]
+    first, gaps = np.array([before[t] for t in both]), np.array([after[t] - before[t] for t in both])
+    if len(both) < 2:
+        return 0.0
+    beyond = float(student.ppf(1 - CHANCE, len(both) - 1)) * gaps.std(ddof=1) / np.sqrt(len(both))
+    return float(gaps.mean() / first.mean()) if abs(gaps.mean()) > beyond else 0.0
 
 
 def _told(run: Run, before: Pass, after: Pass, masks: Mapping[int, Done], name: str) -> dict[str, Any]:
     """What changed from one pass to the next, and which of them explains the raw images better."""
+    was, now = (judge_stage(run, name, x.tracks, x.shapes, masks).counts for x in (before, after))
     learned = held_out_model(run, name, before.tracks, before.shapes)
-    was, now = (
-        {
-            **judge_stage(run, name, x.tracks, x.shapes, masks).counts,
-            "contact_j": held_out_loss_j(run, name, x.tracks, x.shapes, learned),
-        }
-        for x in (before, after)
-    )
-    shares = [now[k] / was[k] - 1 for k in EVIDENCE if was[k] and now[k] is not None]
+    contact = [held_out_losses(run, name, x.tracks, x.shapes, learned) for x in (before, after)]
+    shares = [now[k] / was[k] - 1 for k in ("depth_m", "mask", "color") if was[k] and now[k] is not None]
+    if all(contact):
+        shares.append(certain_share(*contact))
+        was, now = ({**w, "contact_j": float(np.mean(list(c.values())))} for w, c in zip((was, now), contact))
     if now["frames"] + now["lost"]:
         shares.append((now["lost"] - was["lost"]) / (now["frames"] + now["lost"]))
     turned, moved = pose_change(before.tracks, after.tracks)

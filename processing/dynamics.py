@@ -7,14 +7,18 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from scipy.optimize import minimize_scalar
+
 from processing.stage import Counts, Done
 from processing.vision import CAMERA
 from recordings.errors import BadInput
+from recordings.geometry import Transform
 from recordings.results import read_contact, read_shape, read_track, write_contact, write_shape
 from recordings.session_writer import write_json
-from recordings.tracks import ObjectShape
+from recordings.tracks import ContactModel, ObjectShape, ObjectTrack
 
 if TYPE_CHECKING:
+    from processing.contact.judge import TossLoss
     from processing.pipeline import Run
 
 
@@ -115,17 +119,20 @@ def held_out_model(run: Run, name: str, tracks: Mapping[int, Done], shapes: Mapp
     return None if learned.counts.get("kept_out") else learned
 
 
-def held_out_loss_j(
+def held_out_losses(
     run: Run, name: str, tracks: Mapping[int, Done], shapes: Mapping[int, Done], learned: Done | None
-) -> float | None:
-    """Mean contact loss (J) of the tosses that `held_out_model` left out, of a shape at given poses; None without it or
-    where none of them can be used."""
+) -> dict[int, float]:
+    """Contact loss (J) of each toss that `held_out_model` left out, of a shape at given poses; empty without a model or
+    where none of them can be used.
+
+    At the height of the plane that suits shape and poses best: size and height are not identifiable together, and a
+    shape that grew would else be charged for a plane that lies too high.
+    """
     if learned is None:
-        return None
+        return {}
     rest = {t: tracks[t] for t in sorted(tracks)[1::2]}
     done = held_out_stage(run, name, rest, next(iter(shapes.values())), learned)
-    loss = done.counts.get("loss_j")
-    return None if loss is None else float(loss)
+    return {int(t): float(x) for t, x in done.counts.get("loss_j", {}).items()}
 
 
 def held_out_stage(run: Run, name: str, tracks: Mapping[int, Done], shape: Done, learned: Done) -> Done:
@@ -134,18 +141,39 @@ def held_out_stage(run: Run, name: str, tracks: Mapping[int, Done], shape: Done,
     inputs |= {"calibration": run.keys["calibration"]}
 
     def compute(folder: Path) -> Counts:
-        from processing.contact.judge import contact_loss_of, mean_loss_j
-
-        world_from_camera = run.session.calibration.transform("world", CAMERA)
+        run.progress(f"{name}: contact loss of tosses not learned from").step(0, 1, "")
         poses = {t: read_track(d.folder, t) for t, d in tracks.items()}
+        world_from_camera = run.session.calibration.transform("world", CAMERA)
         try:
-            losses = contact_loss_of(poses, read_shape(shape.folder), read_contact(learned.folder), world_from_camera)
+            raised_m, losses = _at_best_height(
+                poses, read_shape(shape.folder), read_contact(learned.folder), world_from_camera
+            )
         except BadInput as why:
             return {"kept_out": str(why)}
         write_json(folder / "losses.json", {str(t): asdict(x) for t, x in losses.items()})
-        return {"loss_j": mean_loss_j(losses), "tosses": len(losses)}
+        return {"loss_j": {str(t): x.loss_j for t, x in losses.items()}, "raised_m": raised_m}
 
-    return run.store.run("held-out", 1, {}, inputs, compute)
+    return run.store.run("held-out", 2, {}, inputs, compute)
+
+
+HEIGHTS_M = (-0.004, 0.004)
+"""How far the plane may lie from where calibration has it."""
+
+
+def _at_best_height(
+    poses: Mapping[int, ObjectTrack], shape: ObjectShape, model: ContactModel, world_from_camera: Transform
+) -> tuple[float, dict[int, TossLoss]]:
+    """How far (m) the plane is raised where the mean loss is least, and the losses there."""
+    from processing.contact.judge import contact_loss_of, mean_loss_j
+    from processing.contact.learn import Plane
+
+    def losses(raised_m: float) -> dict[int, TossLoss]:
+        plane = Plane(model.plane_normal_world, model.plane_offset_m + float(raised_m), "the contact model")
+        return contact_loss_of(poses, shape, model, world_from_camera, plane)
+
+    options = {"xatol": 2e-4}
+    best = minimize_scalar(lambda x: mean_loss_j(losses(x)), bounds=HEIGHTS_M, method="bounded", options=options)
+    return float(best.x), losses(best.x)
 
 
 NO_PLANE = (

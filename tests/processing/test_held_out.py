@@ -10,7 +10,8 @@ import pytest
 import trimesh
 
 from processing.config import Config
-from processing.dynamics import held_out_loss_j, held_out_model
+from processing.cycle import certain_share
+from processing.dynamics import held_out_losses, held_out_model
 from processing.pipeline import Run, start_run
 from processing.stage import Done
 from processing.truth import open_truth
@@ -72,19 +73,39 @@ def stored_shape(run: Run, shape: ObjectShape) -> Done:
     return run.store.run("shape", 1, {}, {"size": str(float(np.ptp(shape.vertices_m)))}, write)
 
 
-def test_a_swollen_shape_has_the_larger_loss_on_tosses_it_was_not_learned_from(
+def test_a_shape_stretched_along_one_axis_has_the_larger_loss_on_tosses_it_was_not_learned_from(
     run: Run, true_tracks: dict[int, Done], true_shape: Done
 ) -> None:
     body = read_shape(true_shape.folder)
-    swollen = stored_shape(run, replace(body, vertices_m=body.vertices_m * 1.1))
+    stretched = stored_shape(run, replace(body, vertices_m=body.vertices_m * np.array([1.2, 1.0, 1.0])))
     learned = held_out_model(run, "test", true_tracks, dict.fromkeys(true_tracks, true_shape))
     assert learned is not None
     small, large = (
-        held_out_loss_j(run, "test", true_tracks, dict.fromkeys(true_tracks, s), learned) for s in (true_shape, swollen)
+        held_out_losses(run, "test", true_tracks, dict.fromkeys(true_tracks, s), learned) for s in (true_shape, stretched)
     )
-    assert small is not None
-    assert large is not None
-    assert large > 1.5 * small
+    assert list(small) == list(large) == list(true_tracks)[1::2]
+    assert sum(large.values()) > 1.3 * sum(small.values())
+
+
+def test_a_shape_one_millimetre_larger_all_round_is_no_evidence_because_the_plane_may_lie_lower(
+    run: Run, true_tracks: dict[int, Done], true_shape: Done
+) -> None:
+    body = read_shape(true_shape.folder)
+    outward = np.sign(body.vertices_m - body.vertices_m.mean(0))
+    larger = stored_shape(run, replace(body, vertices_m=body.vertices_m + 0.001 * outward))
+    learned = held_out_model(run, "test", true_tracks, dict.fromkeys(true_tracks, true_shape))
+    before, after = (
+        held_out_losses(run, "test", true_tracks, dict.fromkeys(true_tracks, s), learned) for s in (true_shape, larger)
+    )
+    assert sum(after.values()) < 1.2 * sum(before.values())
+
+
+def test_a_difference_between_few_tosses_counts_only_beyond_chance() -> None:
+    before = {1: 1.0, 3: 1.1, 5: 0.9, 7: 1.0}
+    assert certain_share(before, {t: 1.3 * x for t, x in before.items()}) == pytest.approx(0.3)
+    assert certain_share(before, {1: 1.5, 3: 0.9, 5: 1.0, 7: 1.0}) == 0.0
+    assert certain_share(before, {t: 0.8 * x for t, x in before.items()}) == pytest.approx(-0.2)
+    assert certain_share({1: 1.0}, {1: 2.0}) == 0.0
 
 
 def test_three_tosses_are_too_few_to_keep_some_for_judging(
@@ -93,4 +114,4 @@ def test_three_tosses_are_too_few_to_keep_some_for_judging(
     few = dict(list(true_tracks.items())[:3])
     shapes = dict.fromkeys(few, true_shape)
     assert held_out_model(run, "test", few, shapes) is None
-    assert held_out_loss_j(run, "test", few, shapes, None) is None
+    assert held_out_losses(run, "test", few, shapes, None) == {}
