@@ -40,6 +40,8 @@ class CourseSettings:
     """How near to gravity the acceleration must be."""
     flight_rms_m: float = 0.012
     """How well a parabola must describe the middle's way; what is seen of a turning thing shifts it."""
+    flight_bow: float = 0.2
+    """The same as a share of the parabola's own bow."""
     flight_m_s: float = 0.4
     """A thing in flight is at least this fast."""
     weight_flight: float = 3.0
@@ -49,14 +51,22 @@ class CourseSettings:
     weight_alike: float = 2.0
     least_score: float = 2.0
     """What speaks less for itself is not taken for the object."""
+    sure_fall: float = 0.5
+    margin: float = 1.0
+    """What does not fall as clearly as this must be told from any other thing by such a difference of scores: between
+    things that merely move, nobody says which is meant."""
+    another: float = 0.3
+    """Less alike (-1..1) is another thing."""
 
 
 @dataclass(frozen=True, eq=False)
 class Course:
-    """One thing through a toss. `fall`: the share of a clear free flight in it, 0..1; `moved_m`: how far it came."""
+    """One thing through a toss. `fall`: how clearly a stretch of it (`fall_span`: its first and last frame) is a free
+    flight, 0..1; `moved_m`: how far it came."""
 
     seen: tuple[Candidate, ...]
     fall: float = 0.0
+    fall_span: tuple[int, int] = (0, 0)
     moved_m: float = 0.0
 
     @property
@@ -79,8 +89,11 @@ def likeness(a: Float[Array, " n"], b: Float[Array, " b"]) -> float:
     return float(np.sqrt(a * b).sum())
 
 
-def join(things: Sequence[Sequence[Candidate]], gravity: Float[Array, "3"] | None, s: CourseSettings) -> list[Course]:
-    """Courses through a toss's frames in time order. `gravity`: its direction in the camera frame, where known."""
+def join(
+    things: Sequence[Sequence[Candidate]], gravity: Float[Array, "3"] | None, s: CourseSettings, gap_s: float = 1.0
+) -> list[Course]:
+    """Courses through a toss's frames in time order. `gravity`: its direction in the camera frame, where known;
+    `gap_s`: the longest time between two frames of a free fall."""
     going: list[list[Candidate]] = []
     ended: list[list[Candidate]] = []
     for here in things:
@@ -97,7 +110,7 @@ def join(things: Sequence[Sequence[Candidate]], gravity: Float[Array, "3"] | Non
                 free_courses.discard(i)
                 free_things.discard(k)
         going += [[here[k]] for k in sorted(free_things)]
-    return [_judged(c, gravity, s) for c in ended + going if len(c) >= s.least_seen]
+    return [_judged(c, gravity, s, gap_s) for c in ended + going if len(c) >= s.least_seen]
 
 
 def _apart(course: Sequence[Candidate], thing: Candidate, s: CourseSettings) -> float:
@@ -118,36 +131,43 @@ def _apart(course: Sequence[Candidate], thing: Candidate, s: CourseSettings) -> 
     return near * 0.6 + 0.2 * (1 - alike) + 0.2 * (ratio - 1) / (s.most_change - 1)
 
 
-def _judged(seen: Sequence[Candidate], gravity: Float[Array, "3"] | None, s: CourseSettings) -> Course:
+def _judged(seen: Sequence[Candidate], gravity: Array | None, s: CourseSettings, gap_s: float) -> Course:
     places = np.array([c.center_m for c in seen])
     moved = float(np.linalg.norm(places - np.median(places, axis=0), axis=1).max())
-    return Course(tuple(seen), free_fall(seen, gravity, s), moved)
+    return Course(tuple(seen), *free_fall(seen, gravity, s, gap_s), moved)
 
 
-def free_fall(seen: Sequence[Candidate], gravity: Float[Array, "3"] | None, s: CourseSettings) -> float:
-    """How clearly a stretch of the course is a free fall: 0 (none) to 1 (twice the least time, or longer)."""
-    best = 0.0
+def free_fall(
+    seen: Sequence[Candidate], gravity: Float[Array, "3"] | None, s: CourseSettings, gap_s: float = 1.0
+) -> tuple[float, tuple[int, int]]:
+    """How clearly a stretch of the course is a free fall: 0 (none) to 1 (twice the least time, or longer); and its
+    first and last frame."""
+    best, span = 0.0, (0, 0)
     times = np.array([c.time_s for c in seen])
     places = np.array([c.center_m for c in seen])
     whole = np.array([c.free > 0 for c in seen])
+    near = np.diff(times, prepend=times[0]) <= gap_s
     for i in range(len(seen) - 3):
         for j in range(i + 4, len(seen) + 1):
-            if not whole[i:j].all() or times[j - 1] - times[i] > 0.5:
+            if not whole[i:j].all() or not near[i + 1 : j].all() or times[j - 1] - times[i] > 0.5:
                 break
             if times[j - 1] - times[i] >= s.flight_s:
-                best = max(best, _falls(times[i:j], places[i:j], gravity, s))
-    return best
+                found = _falls(times[i:j], places[i:j], gravity, s)
+                if found > best:
+                    best, span = found, (seen[i].position, seen[j - 1].position)
+    return best, span
 
 
 def _falls(times: Float[Array, " n"], places: Float[Array, "n 3"], gravity: Array | None, s: CourseSettings) -> float:
     t = times - times.mean()
     terms = np.stack([np.ones_like(t), t, 0.5 * t * t], axis=1)
     found, *_ = np.linalg.lstsq(terms, places, rcond=None)
-    rms = float(np.sqrt(((terms @ found - places) ** 2).sum(1).mean()))
+    rms = float(np.sqrt(((terms @ found - places) ** 2).sum() / (len(t) - terms.shape[1])))
     speed = float(np.linalg.norm(found[1] + found[2] * t[:, None], axis=1).max())
     length = float(np.linalg.norm(found[2]))
     wrong = abs(length - G_M_S2) if gravity is None else float(np.linalg.norm(found[2] - G_M_S2 * gravity))
-    if speed < s.flight_m_s or rms > s.flight_rms_m:
+    bow_m = G_M_S2 * (times[-1] - times[0]) ** 2 / 8  # how far the parabola departs from its chord
+    if speed < s.flight_m_s or rms > min(s.flight_rms_m, s.flight_bow * bow_m):
         return 0.0
     span = min(1.0, 0.5 * (times[-1] - times[0]) / s.flight_s)
     return float(span * np.exp(-0.5 * (wrong / s.flight_sigma_m_s2) ** 2))
@@ -185,25 +205,36 @@ def choose(
     """
     own = {(t, i): own_score(c, s) for t, cs in courses.items() for i, c in enumerate(cs)}
     if known is not None:
-        return _with_reference(courses, own, known, s)
+        return _with_reference(courses, own, known, None, s)
     best: dict[int, tuple[Course, float]] = {}
     for (t, i), score in sorted(own.items(), key=lambda item: -item[1])[:12]:
         if score < s.least_score:
             break
         course = courses[t][i]
-        found = _with_reference(courses, own, Look(course.shares, course.size_m), s)
+        found = _with_reference(courses, own, Look(course.shares, course.size_m), t, s)
         if sum(v for _, v in found.values()) > sum(v for _, v in best.values()):
             best = found
     return best
 
 
 def _with_reference(
-    courses: Mapping[int, Sequence[Course]], own: Mapping[tuple[int, int], float], look: Look, s: CourseSettings
+    courses: Mapping[int, Sequence[Course]],
+    own: Mapping[tuple[int, int], float],
+    look: Look,
+    of_toss: int | None,
+    s: CourseSettings,
 ) -> dict[int, tuple[Course, float]]:
+    """Each toss's best course by its own score and its look. `of_toss`: where the look is from: it
+    proves nothing there."""
     found = {}
     for t, cs in courses.items():
         scored = [(own[t, i] + s.weight_alike * alike(c, look), i) for i, c in enumerate(cs)]
-        if scored and max(scored)[0] >= s.least_score:
-            score, i = max(scored)
+        if not scored or max(scored)[0] < s.least_score:
+            continue
+        score, i = max(scored)
+        told = [own[t, k] if t == of_toss else v for v, k in scored]
+        mine = Look(cs[i].shares, cs[i].size_m)
+        rival = max((told[k] for k, c in enumerate(cs) if alike(c, mine) < s.another), default=0.0)
+        if cs[i].fall >= s.sure_fall or told[i] - rival >= s.margin:
             found[t] = (cs[i], score)
     return found

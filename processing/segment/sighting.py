@@ -30,6 +30,8 @@ class FindSettings:
     courses: CourseSettings = field(default_factory=CourseSettings)
     every_s: float = 0.06
     """Frames are looked at so far apart, and at each toss's first and last."""
+    may_fall: float = 0.15
+    """A course that falls so clearly is looked at in every frame of its fall."""
     again: float = 0.3
     """Another course looks so much like the object (-1..1) that it is the object, seen before or after a gap."""
 
@@ -67,19 +69,33 @@ def courses_of(
 ) -> list[Course]:
     """Everything that moves through a toss. `robot`: drawn for coarse frames."""
     coarse = CoarseFrames(frames, finder.stride)
-    looked_at = positions(frames, settings.every_s)
-    things = []
-    for done, i in enumerate(looked_at):
-        progress(done, len(looked_at))
-        things.append(finder.things(coarse[i], i, robot))
-    return join(things, gravity, settings.courses)
+    things: dict[int, list[Candidate]] = {}
+
+    def look(at: Sequence[int]) -> list[list[Candidate]]:
+        for i in at:
+            things[i] = finder.things(coarse[i], i, robot)
+            progress(len(things), max(len(frames), 1))
+        return [things[i] for i in sorted(things)]
+
+    courses = join(look(positions(frames, settings.every_s)), gravity, settings.courses)
+    falling = [c.fall_span for c in courses if c.fall > settings.may_fall]
+    between = {i for first, last in falling for i in range(first, last) if i not in things}
+    # what seemed to fall is looked at in every frame: noise does not stay on its parabola
+    gap_s = 2.5 * _period_s(frames)
+    return join(look(sorted(between)), gravity, settings.courses, gap_s)
+
+
+def _period_s(frames: Sequence[RgbdFrame]) -> float:
+    if len(frames) < 2:
+        return 0.0
+    return (frames[len(frames) - 1].time_ns - frames[0].time_ns) * 1e-9 / (len(frames) - 1)
 
 
 def positions(frames: Sequence[RgbdFrame], every_s: float) -> list[int]:
     """Positions of frames about so far apart, with the first and the last one."""
     if len(frames) < 2:
         return list(range(len(frames)))
-    period_s = (frames[len(frames) - 1].time_ns - frames[0].time_ns) * 1e-9 / (len(frames) - 1)
+    period_s = _period_s(frames)
     step = max(1, int(every_s / period_s + 0.2)) if period_s > 0 else 1
     return sorted({*range(0, len(frames), step), len(frames) - 1})
 

@@ -51,13 +51,13 @@ def iou(a: np.ndarray, b: np.ndarray) -> float:
 @pytest.mark.parametrize("gravity", [DOWN, None])
 def test_a_free_fall_is_recognised_with_and_without_knowing_where_down_is(gravity: np.ndarray | None) -> None:
     settings = CourseSettings()
-    assert free_fall(thrown([0, 0, 1]), gravity, settings) > 0.8
-    assert free_fall(lying([0, 0, 1]), gravity, settings) == 0
-    assert free_fall(thrown([0, 0, 1], pull=1.0), gravity, settings) < 0.05
+    assert free_fall(thrown([0, 0, 1]), gravity, settings)[0] > 0.8
+    assert free_fall(lying([0, 0, 1]), gravity, settings)[0] == 0
+    assert free_fall(thrown([0, 0, 1], pull=1.0), gravity, settings)[0] < 0.05
 
 
 def test_a_fall_in_another_direction_is_none_where_down_is_known() -> None:
-    assert free_fall(thrown([0, 0, 1]), -DOWN, CourseSettings()) < 0.01
+    assert free_fall(thrown([0, 0, 1]), -DOWN, CourseSettings())[0] < 0.01
 
 
 def test_things_keep_their_courses_where_they_pass_each_other() -> None:
@@ -90,6 +90,20 @@ def test_a_hand_at_the_images_border_is_not_taken_for_the_object() -> None:
     courses = join([list(pair) for pair in zip(hand, thrown([0, 0, 1]))], DOWN, CourseSettings())
     (course, _), *_ = choose({0: courses}, None, CourseSettings()).values()
     assert course.shares.argmax() == RED.argmax()
+
+
+def test_between_two_things_that_merely_move_nobody_chooses() -> None:
+    settings = CourseSettings()
+
+    def pushed(x_m: float, shares: np.ndarray) -> list[Candidate]:
+        return [thing(i, np.array([x_m + 0.02 * i, 0, 1]), shares) for i in range(14)]
+
+    one, two = pushed(-0.5, RED), pushed(0.5, GREEN)
+    assert choose({0: join([[a] for a in one], DOWN, settings)}, None, settings)
+    both = {0: join([list(pair) for pair in zip(one, two)], DOWN, settings)}
+    assert choose(both, None, settings) == {}
+    (course, _), *_ = choose(both, Look(GREEN, 0.08), settings).values()
+    assert course.shares.argmax() == GREEN.argmax()
 
 
 def test_the_clearest_frame_is_where_the_object_stands_free_and_whole(
