@@ -79,7 +79,8 @@ class Corner:
 @dataclass(frozen=True, eq=False)
 class Solved:
     """`layout`: tagged_from_tag (pupil-apriltags' tag frame). `cameras`: world_from_camera and its covariance.
-    `moved[(camera, toss)]`: how far it stood from its place, rad and m. `unplaced`: what nothing connects."""
+    `moved[(camera, toss)]`: how far it stood from its place, rad and m. `unplaced`: what nothing connects.
+    `table_off_m`: how far each table tag lies from its place in the calibration."""
 
     tracks: Mapping[int, BodyTrack]
     layout: Mapping[int, Float[Array, "4 4"]]
@@ -90,6 +91,7 @@ class Solved:
     center_m: Float[Array, "3"]
     corners: tuple[Corner, ...]
     unplaced: tuple[str, ...]
+    table_off_m: Mapping[int, float] = field(default_factory=dict)
     arcs: int = 0
     noise_factor: float = field(default=1.0)
 
@@ -289,6 +291,11 @@ def _solved(
         center_m=center,
         corners=corners,
         unplaced=tuple(" ".join(k[:2]) for k in growth.missing()),
+        table_off_m={
+            i: float(np.linalg.norm(poses[index[tag_key(i)]][:3, 3] - tag.pose.pose[:3, 3]))
+            for i, tag in problem.config.body(WORLD).tags.items()
+            if tag.pose is not None and tag_key(i) in index
+        },
         arcs=len(in_flight),
         noise_factor=factor,
     )

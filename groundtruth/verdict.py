@@ -15,6 +15,10 @@ from recordings.tracks import RigCalibration
 
 GOOD_PX = 0.5
 """Median corner error above this: something is wrong with the cameras, the tags or their sizes."""
+GROSS_PX = 3.0
+"""A tag that is off by more is not what it is taken for."""
+TABLE_M = 0.005
+"""Nor is a table tag that lies farther than this from its place."""
 BUMPED_M, BUMPED_RAD = 0.0015, 0.002
 OFF_FACTOR = 4.0
 """A tag or camera whose residual is this many times the others' is named."""
@@ -55,10 +59,23 @@ def judge(
             "or the tags' sizes are wrong; run `toss-calibrate cameras` again"
         )
     worst = _outstanding({n: v for n, v in by.items() if n.startswith("tag")}, overall)
-    if worst is not None:
+    if worst is not None and by[worst] > GROSS_PX:
+        number = worst.removeprefix("tag ")
+        faults.append(
+            f"{worst} is off by {by[worst]:.1f} px where others are by {overall:.2f}: it is on two bodies, or not "
+            f"where calibration.json has it, and draws the cameras along; leave it out (`--ignore {number}`), or "
+            "correct calibration.json"
+        )
+    elif worst is not None:
         warnings.append(
             f"{worst} is off by {by[worst]:.2f} px where others are by {overall:.2f}: is it bent, or loose?"
         )
+    for tag, off_m in solved.table_off_m.items():
+        if off_m > TABLE_M:
+            faults.append(
+                f"tag {tag} lies {1000 * off_m:.0f} mm from its place on the table in calibration.json, and draws the "
+                f"cameras along; leave it out (`--ignore {tag}`), or correct calibration.json"
+            )
     bumped = [(k, v) for k, v in solved.moved.items() if v[0] > BUMPED_RAD or v[1] > BUMPED_M]
     for (camera, toss), (turn, shift) in bumped:
         warnings.append(

@@ -248,6 +248,16 @@ def test_an_impact_is_not_smoothed_over():
     assert found.extra_m.max() > 0.0
 
 
+def test_a_table_tag_that_lies_elsewhere_makes_the_truth_unfit(toss_lab):
+    made = toss_lab(tosses=1, frames=8)
+    tag = made.calibration.table_tags[1]
+    pose = replace(tag.world_from_tag, translation_m=tag.world_from_tag.translation_m + [0.06, 0.0, 0.0])
+    wrong = replace(made.calibration, table_tags=(made.calibration.table_tags[0], replace(tag, world_from_tag=pose)))
+    _, verdict = solved(made, wrong)
+    assert not verdict.good
+    assert any("mm from its place on the table" in f and "--ignore 3" in f for f in verdict.faults)
+
+
 def test_far_outside_there_is_no_pose():
     times = np.arange(4) / 30
     motion = classify(times, arc(times, [0.0, 0, 0], np.zeros(3)), np.zeros(3), np.array([False, True, True, False]))
