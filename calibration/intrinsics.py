@@ -102,8 +102,16 @@ def _kept(camera: str, given: CameraModel, fit: _Fit, views: Sequence[TargetView
         {"rms_px": solved.rms_px, "views": len(np.unique(seen.view)), "points": len(seen)},
         {"rms_px": solved.rms_px, "fitted_rms_px": fit.hold_out_px},
         {f"fitted_{name}": value for name, value in _uncertainty(fit).items()},
-        (Finding("note", text), *limit(solved.rms_px, f"{camera}'s residual", "px", GOOD_PX, WORST_PX)),
-        {"lens": "given", "rejected_views": sorted(fit.rejected)},
+        (
+            Finding("note", text),
+            *limit(solved.rms_px, f"{camera}'s residual", "px", GOOD_PX, WORST_PX),
+            *_judge_views(camera, fit, views, (given.width, given.height)),
+        ),
+        {
+            "lens": "given",
+            "coverage": coverage(seen.pixels, (given.width, given.height)),
+            "rejected_views": sorted(fit.rejected),
+        },
     )
     return Lens(given, report, solved.residual_px, seen.pixels)
 
@@ -200,6 +208,12 @@ def _judge(camera: str, fit: _Fit, views: Sequence[TargetView], size: tuple[int,
     found += limit(focal, f"the deviation of {camera}'s focal length", "%", GOOD_FOCAL_PERCENT, WORST_FOCAL_PERCENT)
     if fit.rejected:
         found.append(Finding("note", f"{camera}: {len(fit.rejected)} views left out for their residuals"))
+    return found + _judge_views(camera, fit, views, size)
+
+
+def _judge_views(camera: str, fit: _Fit, views: Sequence[TargetView], size: tuple[int, int]) -> list[Finding]:
+    """Whether there are enough views, all over the image and tilted."""
+    found = []
     if len(views) < GOOD_VIEWS:
         found.append(Finding("warning", f"{camera} has {len(views)} views, wanted {GOOD_VIEWS} or more"))
     share = coverage(fit.seen.pixels, size)
