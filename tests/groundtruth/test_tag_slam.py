@@ -156,8 +156,8 @@ def test_relative_poses_distances_and_coordinates_pull_where_they_should():
 
 
 def wall_with_two_tags(minimum_area: float = 0.0, second_size_m: float = 0.3):
-    """A rig drives along a wall, past a tag of known place and one of unknown place; its odometry turns half a degree too
-    much a stamp."""
+    """A rig drives along a wall, past a tag of known place and one of unknown place; its odometry turns by half a
+    degree too much a stamp."""
     known = NoisyPose(FACING, np.diag([1e4] * 6))
     wall = BodyEntry(
         "wall",
