@@ -241,6 +241,28 @@ def test_ctrl_c_keeps_everything_so_far(after_s: float, rig: str, tmp_path: Path
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("after_s", [0.3, 2.0])
+def test_a_killed_session_goes_on_by_resume(after_s: float, rig: str, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    command = [sys.executable, "-m", "acquisition.cli", "--rig", rig, "--tosses", "50", "--yes", str(out)]
+    process = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.DEVNULL)
+    ends = time.monotonic() + 60
+    while not (out / "toss_01.mcap").exists() and time.monotonic() < ends:
+        time.sleep(0.02)
+    time.sleep(after_s)
+    process.kill()
+    process.wait()
+    first, before = (out / "toss_00.mcap").read_bytes(), len(list(out.glob("toss_*.mcap")))
+    assert main(["--rig", rig, "--yes", "--resume", str(out)]) == 0
+    assert (out / "toss_00.mcap").read_bytes() == first
+    assert verify(out).ok
+    with Session.open(out) as session:
+        assert len(session.tosses) >= before
+        starts = [session.toss(k).color().times_ns[0] for k in session.tosses if len(session.toss(k).color())]
+    assert starts == sorted(starts)
+
+
+@pytest.mark.slow
 def test_a_replayed_session_is_recorded_again(rig: str, tmp_path: Path) -> None:
     first, again = tmp_path / "first", tmp_path / "again"
     assert main(["--rig", rig, "--yes", str(first)]) == 0

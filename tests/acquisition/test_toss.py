@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from acquisition.arm_thrower import ArmThrower, base_in_world, estimate_delay, onset_s
+from acquisition.dynamics import PAYLOAD_KG, torques
 from acquisition.kinematics import Batch, segment_distance
 from acquisition.operator import Nobody
 from acquisition.rig import TossConfig
@@ -56,6 +57,31 @@ def test_the_ur5e_stands_where_its_data_sheet_says() -> None:
     # at zero the arm lies along -x: a2 + a3 = 817.2 mm; the flange is d4 + d6 to the side, d1 - d5 high
     tool = arm_model("ur5e").robot.links(np.zeros(6))["link6"]
     np.testing.assert_allclose(tool.translation_m, [-0.8172, -0.1333 - 0.0996, 0.1625 - 0.0997], atol=1e-9)
+
+
+def test_the_ur5e_holds_its_weight_with_the_slope_of_its_potential_energy() -> None:
+    """Virtual work: at rest, each joint's torque is the change of height times weight that its turn makes."""
+    model = arm_model("ur5e")
+
+    def energy_j(q: np.ndarray) -> float:
+        links = model.robot.links(q)
+        held = PAYLOAD_KG * links[model.tool].translation_m[2]
+        return 9.81 * (held + sum(b.mass_kg * links[b.link].points(np.array([b.centre_m]))[0, 2] for b in model.bodies))
+
+    q, h, still = np.array([0.3, -1.0, 1.2, -0.5, 0.4, 0.2]), 1e-5, np.zeros((1, 6))
+    slope = [(energy_j(q + h * e) - energy_j(q - h * e)) / (2 * h) for e in np.eye(6)]
+    np.testing.assert_allclose(torques(model, q[None], still, still)[0], slope, atol=1e-4)
+
+
+@pytest.mark.parametrize("name", ARMS)
+def test_a_torque_beyond_its_limit_is_named(name: str) -> None:
+    model = arm_model(name)
+    weak = replace(model, torque_nm=model.torque_nm * 1e-3)
+    t = np.arange(0, 0.1, 0.001)
+    q = np.tile(model.ready_rad, (len(t), 1))
+    breach = check_limits(weak, Samples(t, q, np.zeros_like(q), np.zeros_like(q)))
+    assert breach is not None
+    assert (breach.what, breach.unit) == ("torque", "Nm")
 
 
 def test_inverse_kinematics_find_back(model: ArmModel) -> None:
