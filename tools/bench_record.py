@@ -331,8 +331,10 @@ def bench_detect(count: int, part: str) -> bool:
     numbers = share(count, part)
     for seed in sorted({11 + k // per_lab for k in numbers}):
         tosses = [k % per_lab for k in numbers if 11 + k // per_lab == seed]
-        for off, late_s in toss_by_toss(seed, tosses):
+        for toss, (off, late_s) in zip(tosses, toss_by_toss(seed, tosses)):
             done += 1
+            if any(e is None or abs(e) > 1.0 for e in off.values()) or late_s is None or late_s < -0.2:
+                print(f"  lab {seed}, toss {toss}: frames off {off}, over {late_s} s after rest")
             for name, error in off.items():
                 hits[name] += error is not None and abs(error) <= 1.0
             early += late_s is None or late_s < -0.2
