@@ -15,9 +15,11 @@ from processing.contact.fuse import Surface
 from processing.contact.geometry import SCALE_M
 from processing.contact.inertia import Physics
 from processing.contact.judge import losses_of
-from processing.contact.learn import ContactConfig, Plane, learn_contact, prepare
+from processing.contact.learn import ContactConfig, learn_contact, penetration_of
 from processing.contact.loss import Weights
 from processing.contact.motion import PoseSeries
+from processing.contact.plane import Plane
+from processing.contact.prepared import prepare
 from processing.contact.prior import Prior, prior_from_shape
 from processing.contact.support import CAP_M2, surface_samples, trimmed_vertices, volume_m3
 from recordings.tracks import ObjectShape
@@ -107,10 +109,11 @@ def _tested_choice(
     empty: float,
 ) -> GeometryChoice:
     """Learn both on every second toss with few iterations, and compare the contact loss of the others."""
+    penetration = penetration_of(config, series)
     quick = replace(
         config,
         bootstrap_repeats=0,
-        weights=config.weights or Weights(dissipation=config.one_toss_dissipation, penetration=config.penetration),
+        weights=config.weights or Weights(dissipation=config.one_toss_dissipation, penetration=penetration),
         fit=replace(config.fit, adam_iterations=60),
     )
     learned, held_out = series[::2], series[1::2]

@@ -243,13 +243,17 @@ def _angular_gaps(tosses: Sequence[PoseSeries]) -> Gaps:
     }
 
 
-def lowest_point_m(series: PoseSeries, points_m: Float[Array, "v 3"], phases: Phases) -> float | None:
-    """Height of the lowest point above the plane (z = 0), median over the rest at the end. None where it does not
-    rest."""
+def lowest_point_m(
+    series: PoseSeries, points_m: Float[Array, "v 3"], phases: Phases, share: float = 0.0
+) -> float | None:
+    """Height of the lowest point above the plane (z = 0), or that which a share of the points lies below; median over
+    the rest at the end. None where it does not rest."""
     if phases.rest is None:
         return None
     rest = slice(phases.rest, None)
-    return float(np.median((series.rotation[rest, 2] @ points_m.T).min(1) + series.position_m[rest, 2]))
+    heights = series.rotation[rest, 2] @ points_m.T
+    lowest = heights.min(1) if share == 0 else np.quantile(heights, share, axis=1)
+    return float(np.median(lowest + series.position_m[rest, 2]))
 
 
 def check_plane(heights_m: Mapping[int, float], what: str) -> float | None:

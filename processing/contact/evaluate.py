@@ -11,8 +11,10 @@ from jaxtyping import Float
 from numpy import ndarray as Array
 from scipy.stats import t as student
 
-from processing.contact.learn import ContactLearning, Plane, Prepared, prepare, starts
+from processing.contact.learn import ContactLearning
 from processing.contact.motion import PoseSeries
+from processing.contact.plane import Plane
+from processing.contact.prepared import Prepared, prepare, starts
 from processing.contact.rollout import Rollout, RolloutErrors, Start, rollout_errors, simulate
 from processing.contact.smooth import Smoothed
 

@@ -15,7 +15,8 @@ from processing.contact.evaluate import FIGURE_4_STEPS, Evaluation, evaluate
 from processing.contact.from_tracks import TrackLearning, TracksConfig, learn_from_tracks
 from processing.contact.inertia import Physics
 from processing.contact.judge import series_of, usable
-from processing.contact.learn import ContactLearning, Plane
+from processing.contact.learn import ContactLearning
+from processing.contact.plane import Plane
 from recordings.errors import BadInput
 from recordings.geometry import Transform
 from recordings.progress import Progress

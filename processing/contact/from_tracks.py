@@ -19,11 +19,20 @@ from processing.contact.fuse import Field, FusionConfig, Readings, Sizes, Surfac
 from processing.contact.geometry import SCALE_M, FreePoints, hull_mesh
 from processing.contact.inertia import Physics, uniform_physics
 from processing.contact.judge import losses_of, mean_loss_j, series_of, usable
-from processing.contact.learn import ContactConfig, ContactLearning, Plane, learn_contact, results_of
+from processing.contact.learn import (
+    ContactConfig,
+    ContactLearning,
+    learn_contact,
+    results_of,
+    rolled_friction,
+    with_friction,
+)
 from processing.contact.loss import REFERENCE_MASS_KG, contact_loss, find_contacts, point_velocity
 from processing.contact.motion import GRAVITY_M_S2, PoseSeries
+from processing.contact.plane import Plane
 from processing.contact.prior import Prior
 from processing.contact.result import result_document, warnings_of
+from processing.contact.support import surface_samples
 from recordings.errors import BadInput
 from recordings.geometry import Transform
 from recordings.progress import Progress, Silent
@@ -33,6 +42,9 @@ REACH = 0.15
 """Neighbourhood of a touched point in which the prior is compared with it, as a share of the mean extent."""
 BLUR = 0.1
 """What a touch reads is blurred by this share of the point's way between two frames: the impact was somewhere on it."""
+SUNK_SHARE = 0.01
+"""So much of the surface must lie below the plane before the shape counts as sunk into it; less is spikes."""
+SURFACE_POINTS = 4000
 NEAR_M = 0.005
 """A point this near to the plane may read the surface."""
 
@@ -122,7 +134,7 @@ def learn_from_series(
     refined = ObjectShape(
         shape.object_frame, "contact", shape.vertices_m + moved, shape.faces, shape.vertex_rgb, shape.observed
     )
-    fused = _fused(learning, prior, physics, plane, field_)
+    fused = _fused(learning, prior, physics, plane, field_, config.contact)
     rollouts = evaluate(
         fused, series, plane, FIGURE_4_STEPS, config.contact.rollout_step_s, "release", ready=learning.prepared
     )
@@ -146,10 +158,10 @@ def _check_frames(tracks: Mapping[int, ObjectTrack], shape: ObjectShape, world_f
 
 
 def _check_seen_rests(learning: ContactLearning, shape: ObjectShape, prior: Prior) -> None:
-    """Raises BadInput where points that a camera saw rest more than 5 mm off the plane: the plane or the scale is
-    wrong. What no camera saw proves nothing."""
+    """Raises BadInput where what a camera saw rests more than 5 mm off the plane: the plane or the scale is wrong.
+    What no camera saw proves nothing, and neither does a spike that reaches below the plane."""
     local = prior.frame.inside(shape.vertices_m)
-    points = start_points(prior)
+    points, (surface, _) = start_points(prior), surface_samples(local, shape.faces, SURFACE_POINTS)
     seen = np.ones(len(points), dtype=bool)
     if shape.observed is not None:
         from scipy.spatial import cKDTree
@@ -161,7 +173,9 @@ def _check_seen_rests(learning: ContactLearning, shape: ObjectShape, prior: Prio
             continue
         reach = track.rotation[smoothed.phases.rest :, 2].mean(0) @ points.T
         if seen[reach.argmin()]:
-            heights[track.toss] = lowest_point_m(track, points, smoothed.phases) or 0.0
+            lowest = lowest_point_m(track, points, smoothed.phases) or 0.0
+            sunk = lowest_point_m(track, surface, smoothed.phases, SUNK_SHARE) or 0.0
+            heights[track.toss] = lowest if lowest > 0 else max(lowest, min(sunk, 0.0))
     check_plane(heights, "vision's shape (a part that a camera saw)")
 
 
@@ -218,7 +232,9 @@ def _field(
     return Field(readings, sizes, config, surface, plane_m), readings, sizes
 
 
-def _fused(learning: ContactLearning, prior: Prior, physics: Physics, plane: Plane, moves: Field) -> ContactLearning:
+def _fused(
+    learning: ContactLearning, prior: Prior, physics: Physics, plane: Plane, moves: Field, contact_config: ContactConfig
+) -> ContactLearning:
     """The prior's support moved by the field, and the friction that goes with it."""
     frame, geometry = prior.frame, learning.fitted.geometry
     start = frame.back(start_points(prior))
@@ -227,10 +243,10 @@ def _fused(learning: ContactLearning, prior: Prior, physics: Physics, plane: Pla
     model = Model(FreePoints(points, geometry.pieces(), geometry.contacts), learning.fitted.inertia_start_kgm2, config)
     begin = np.concatenate([points.ravel() / SCALE_M, learning.fit.parameters[FRICTION:]])
     found = fit_lbfgs(model, begin, learning.data, learning.weights, 20)
+    rolled = rolled_friction(model, found.parameters, learning.prepared, contact_config)
+    found, spread = with_friction(found, learning.spread, rolled)
     moved = replace(prior, geometry=model.geometry)
-    contact, _, friction, sizes = results_of(
-        model, found.parameters, learning.spread, moved, physics, plane, learning.touched
-    )
+    contact, _, friction, sizes = results_of(model, found.parameters, spread, moved, physics, plane, learning.touched)
     return replace(
         learning,
         model=contact,

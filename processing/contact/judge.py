@@ -13,9 +13,10 @@ from numpy import ndarray as Array
 
 from processing.contact.data_checks import lowest_point_m
 from processing.contact.inertia import Physics
-from processing.contact.learn import Plane, Prepared, prepare, transitions
 from processing.contact.loss import REFERENCE_MASS_KG, Body, StepData, Weights, contact_loss, idle_terms, step_terms
 from processing.contact.motion import PoseSeries
+from processing.contact.plane import Plane
+from processing.contact.prepared import Prepared, prepare, transitions
 from processing.contact.prior import Frame
 from processing.contact.support import CAP_M2, trimmed_hull
 from recordings.geometry import Transform

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -12,55 +12,22 @@ from jaxtyping import Bool, Float
 from numpy import ndarray as Array
 
 from processing.contact import data_checks as checks
-from processing.contact.fit import Fit, FitConfig, Model, fit
+from processing.contact.fit import FRICTION, Fit, FitConfig, Model, fit
+from processing.contact.friction import STEP_S, RolledFriction, frames_are_slow, friction_by_rollouts
 from processing.contact.geometry import GeometryName
 from processing.contact.inertia import Physics
 from processing.contact.intervals import Interval, Spread, bootstrap, curvature, extents, plane_sensitivity
 from processing.contact.loss import REFERENCE_MASS_KG, Body, StepData, Weights, contact_loss
-from processing.contact.motion import GRAVITY_M_S2, PoseSeries, States, Steps, differences, steps_of
+from processing.contact.motion import PoseSeries, Steps
+from processing.contact.plane import Plane as Plane  # others know it from here
+from processing.contact.plane import calibrated_plane as calibrated_plane
+from processing.contact.prepared import Prepared, prepare, starts, transitions
 from processing.contact.prior import Frame, Prior, learned_shape
-from processing.contact.rollout import Start
-from processing.contact.smooth import Smoothed, smooth
 from processing.contact.unexplained import unexplained_rows
 from processing.contact.weights import HeldOut, Sweep, SweepConfig, sweep_weights
 from recordings.errors import BadInput
 from recordings.progress import Progress, Silent
-from recordings.tracks import ContactModel, ObjectShape, RigCalibration
-
-
-@dataclass(frozen=True, eq=False)
-class Plane:
-    """The ground in `world`: normal . x = offset."""
-
-    normal_world: Float[Array, "3"] = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
-    offset_m: float = 0.0
-    source: str = "z = 0 of world"
-    std_m: float | None = None
-    """Standard deviation of the height, where the calibration says it."""
-
-    def level_from_world(self) -> Float[Array, "3 3"]:
-        """The rotation that turns the normal to z by the shortest way."""
-        n = np.asarray(self.normal_world, dtype=np.float64) / np.linalg.norm(self.normal_world)
-        axis, cosine = np.cross(n, [0.0, 0.0, 1.0]), float(n[2])
-        if cosine < -0.99:
-            raise BadInput(f"the plane's normal {n.tolist()} points down; wanted up, against gravity")
-        K = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
-        return np.eye(3) + K + K @ K / (1 + cosine)
-
-
-def calibrated_plane(calibration: RigCalibration) -> Plane:
-    """`residuals["table"]` of a calibration: {normal_world, offset_m, std_m, source}; z = 0 of `world` where it is not
-    there. Raises BadInput for a table that is no plane."""
-    given = (calibration.residuals or {}).get("table")
-    if not isinstance(given, Mapping) or "normal_world" not in given or "offset_m" not in given:
-        return Plane(source="z = 0 of world (the calibration has no table)")
-    normal = np.array(given["normal_world"], dtype=np.float64)
-    if normal.shape != (3,) or not np.isfinite(normal).all() or not np.linalg.norm(normal) > 0.5:
-        raise BadInput(f"calibration: residuals.table.normal_world is {given['normal_world']}; wanted a unit vector")
-    length = float(np.linalg.norm(normal))
-    std = given.get("std_m")
-    source = f"calibration.json: table ({given.get('source', 'no source given')})"
-    return Plane(normal / length, float(given["offset_m"]) / length, source, None if std is None else float(std))
+from recordings.tracks import ContactModel, ObjectShape
 
 
 @dataclass(frozen=True)
@@ -71,26 +38,19 @@ class ContactConfig:
     sweep: SweepConfig = field(default_factory=SweepConfig)
     weights: Weights | None = None
     """None: chosen by held-out rollouts (SweepConfig). `Weights()` are the paper's."""
-    penetration: float = 1.0
-    """Weight of the fourth term where the weights are chosen. 1 is the paper's; free points of a vision mesh at 30 Hz
-    want Vysics' 20, else single corners reach through the plane to meet an impact between two frames."""
+    penetration: float | None = None
+    """Weight of the fourth term where the weights are chosen. None: the paper's 1; where frames are far apart
+    (friction.SLOW_S) Vysics' 20, else corners reach through the plane to meet an impact between two frames."""
     one_toss_dissipation: float = 30.0
     """Of a single toss, from which nothing can be held out."""
+    friction_by_rollouts: bool = True
+    """Where frames are far apart, the weights are chosen and there are tosses enough (friction.py)."""
     bootstrap_repeats: int = 16
     rollout_steps: int = 80
     rollout_step_s: float = 1 / 148
     smooth: bool = True
     """False: raw differences of the poses."""
     seed: int = 0
-
-
-@dataclass(frozen=True, eq=False)
-class Prepared:
-    """Tosses that can be learned from: about the centre of mass, in a world whose plane is z = 0."""
-
-    tracks: tuple[PoseSeries, ...]
-    smoothed: tuple[Smoothed, ...]
-    left_out: Mapping[int, str]
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,54 +93,6 @@ class ContactLearning:
         return self.fitted.numbers(self.fit.parameters)
 
 
-def prepare(tracks: Sequence[PoseSeries], frame: Frame, plane: Plane, inertia: Float[Array, "3 3"]) -> Prepared:
-    """Move tracks to the learning frame, check them one by one, smooth them. What cannot be used is left out and
-    named."""
-    level = plane.level_from_world()
-    kept, smoothed, left_out = [], [], {}
-    for track in tracks:
-        try:
-            checks.check_frames(track)
-        except BadInput as wrong:
-            left_out[track.toss] = str(wrong)
-            continue
-        moved = frame.of(track).turned(level, plane.offset_m)
-        kept.append(moved)
-        smoothed.append(smooth(moved, inertia))
-    if not kept:
-        raise BadInput("no toss can be used: " + "; ".join(left_out.values()) if left_out else "no tosses were given")
-    return Prepared(tuple(kept), tuple(smoothed), left_out)
-
-
-def starts(
-    prepared: Prepared, step_s: float, inertia: Float[Array, "3 3"], begin: Sequence[int] | None = None
-) -> tuple[Start, list[int]]:
-    """The smoothed state each toss is rolled out from in steps of `step_s`, and its frame: `begin`, else the release
-    (frame 0 where no flight was found).
-
-    A velocity of the track is the mean over a frame's interval dt. The one at the frame itself, v0, is the one whose
-    rollout covers the next interval as the track does: with v[k+1] = v[k] + h a, the mean over dt = n h is
-    v0 + a (dt + h) / 2. At 30 Hz the difference to v is 0.2 m/s; and what a hand did before the release stays out.
-    """
-    frames = [s.phases.release or 0 for s in prepared.smoothed] if begin is None else list(begin)
-    rows = [_start_row(s.states, b, step_s, inertia) for s, b in zip(prepared.smoothed, frames)]
-    return Start(*(np.stack(values) for values in zip(*rows))), frames
-
-
-def _start_row(states: States, frame: int, step_s: float, inertia: Float[Array, "3 3"]) -> tuple[Array, ...]:
-    later = min(frame + 1, len(states) - 1)
-    half = 0.5 * (states.time_s[later] - states.time_s[frame] + step_s)
-    spin = states.spin_object_rad_s[later]
-    turning = -np.linalg.solve(inertia, np.cross(spin, inertia @ spin))
-    gravity = np.array([0.0, 0.0, -GRAVITY_M_S2])
-    return (
-        states.rotation[frame],
-        states.position_m[frame],
-        spin - half * turning,
-        states.velocity_world_m_s[later] - half * gravity,
-    )
-
-
 def learn_contact(
     tracks: Sequence[PoseSeries],
     prior: Prior,
@@ -213,13 +125,16 @@ def learn_contact(
     if bool(odd.any()):
         data.weight[odd] = 0.0
         fits.append(fit(fitted, fits[0].parameters, data, weights))
+    optimum = fits[-1].parameters
+    rolled = rolled_friction(fitted, optimum, prepared, config)
     cpu_seconds = time.process_time() - started
     progress.step(3, 6, "fitted")
-    optimum = fits[-1].parameters
     spread = _spread(fitted, optimum, data, weights, config, len(prepared.tracks))
     progress.step(4, 6, "intervals")
     sensitivity = plane_sensitivity(fitted, optimum, data, weights)
     progress.step(5, 6, "sensitivity")
+    last, spread = with_friction(fits[-1], spread, rolled)
+    optimum = last.parameters
     body = fitted.numbers(optimum)
     touched = touched_points(fitted, body, data, weights)
     _check_learned_plane(prepared, body)
@@ -235,7 +150,7 @@ def learn_contact(
         spread=spread,
         weights=weights,
         sweep=sweep,
-        fit=fits[-1],
+        fit=last,
         fitted=fitted,
         frame=prior.frame,
         tosses=tuple(t.toss for t in prepared.tracks),
@@ -283,15 +198,6 @@ def _check_learned_plane(prepared: Prepared, body: Body) -> None:
     checks.check_plane(_rest_heights(prepared, body.points_m.cpu().numpy()), "the learned shape")
 
 
-def transitions(prepared: Prepared, smoothed: bool = True) -> Steps:
-    """Transitions from the release on: what a hand does is not learned."""
-    states = [s.states if smoothed else differences(t) for t, s in zip(prepared.tracks, prepared.smoothed)]
-    steps = steps_of(states)
-    release = {s.states.toss: s.phases.release or 0 for s in prepared.smoothed}
-    begin = np.array([release[t] for t in steps.toss.tolist()])
-    return steps.only(steps.frame >= begin + 2)
-
-
 def _require_contact(fitted: Model, steps: Steps, prepared: Prepared) -> None:
     """Raises BadInput where flight explains everything."""
     touching = [s for s in prepared.smoothed if not s.phases.in_flight.all()]
@@ -308,8 +214,9 @@ def _choose_weights(
 ) -> tuple[Sweep | None, Weights]:
     if config.weights is not None:
         return None, config.weights
+    penetration = penetration_of(config, prepared.tracks)
     if len(prepared.tracks) < 3:
-        return None, Weights(dissipation=config.one_toss_dissipation, penetration=config.penetration)
+        return None, Weights(dissipation=config.one_toss_dissipation, penetration=penetration)
     start, begin = starts(prepared, config.rollout_step_s, fitted.inertia_start_kgm2)
     held_out = HeldOut(prepared.tracks, start, begin, config.rollout_steps, config.rollout_step_s)
     sweep = sweep_weights(
@@ -318,9 +225,37 @@ def _choose_weights(
         held_out,
         config.sweep,
         lambda done, total: progress.step(1, 6, f"weights {done}/{total}"),
-        Weights(penetration=config.penetration),
+        Weights(penetration=penetration),
     )
-    return sweep, Weights(dissipation=sweep.chosen.dissipation, penetration=config.penetration)
+    return sweep, Weights(dissipation=sweep.chosen.dissipation, penetration=penetration)
+
+
+def penetration_of(config: ContactConfig, tracks: Sequence[PoseSeries]) -> float:
+    """The weight of the fourth term: as configured, or by how far frames are apart."""
+    if config.penetration is not None:
+        return config.penetration
+    return 20.0 if frames_are_slow(tracks) else 1.0
+
+
+def rolled_friction(
+    fitted: Model, optimum: Float[Array, " p"], prepared: Prepared, config: ContactConfig
+) -> RolledFriction | None:
+    """The friction by rollouts where it is better than the loss's; None where it is not, or not asked for."""
+    if config.weights is not None or not config.friction_by_rollouts or not frames_are_slow(prepared.tracks):
+        return None
+    start, begin = starts(prepared, STEP_S, fitted.inertia_start_kgm2)
+    body, contacts = fitted.numbers(optimum), fitted.geometry.contacts
+    return friction_by_rollouts(body, contacts, prepared.tracks, prepared.smoothed, start, begin, config.seed)
+
+
+def with_friction(done: Fit, spread: Spread, rolled: RolledFriction | None) -> tuple[Fit, Spread]:
+    """A fit and its intervals with the friction by rollouts, where there is one."""
+    if rolled is None:
+        return done, spread
+    parameters = done.parameters.copy()
+    parameters[FRICTION] = rolled.value**0.5
+    method = f"{spread.method}; friction by rollouts"
+    return replace(done, parameters=parameters), replace(spread, method=method, friction=rolled.half_width)
 
 
 def _spread(

@@ -22,8 +22,9 @@ from processing.contact.figure import draw_result
 from processing.contact.fit import FitConfig
 from processing.contact.from_tracks import TracksConfig, learn_from_series
 from processing.contact.inertia import Physics, physics_of_session, uniform_box_physics, uniform_physics
-from processing.contact.learn import ContactConfig, ContactLearning, Plane, calibrated_plane, learn_contact
+from processing.contact.learn import ContactConfig, ContactLearning, learn_contact
 from processing.contact.motion import PoseSeries
+from processing.contact.plane import Plane, calibrated_plane
 from processing.contact.prior import Prior, prior_from_shape, prior_from_size
 from processing.contact.result import result_document, result_text, warnings_of
 from processing.contact.segment import find_phases

@@ -51,7 +51,7 @@ def test_a_jumping_toss_is_left_out_and_the_others_are_used(simulated_tosses, bo
     position = tracks[1].position_m.copy()
     position[50:] += [0.2, 0, 0]
     tracks[1] = replace(tracks[1], position_m=position)
-    from processing.contact.learn import prepare
+    from processing.contact.prepared import prepare
 
     prepared = prepare(tracks, prior_from_size("box", 0.08).frame, Plane(), box_physics.inertia_kgm2)
     assert [t.toss for t in prepared.tracks] == [0, 2]

@@ -135,6 +135,29 @@ def test_a_plane_that_contradicts_what_the_camera_saw_is_refused(simulated_tosse
         learn_from_tracks(tracks, noisy_box(), raised, config=QUICK)
 
 
+def test_spikes_below_the_table_do_not_keep_contact_out(simulated_tosses):
+    """Six blobs of 9 mm on each face, as a field leaves them: the lowest vertex is far below the table at rest, the
+    surface is not. A shape that is sunk as a whole is still refused."""
+    from processing.contact.data_checks import lowest_point_m
+    from processing.contact.segment import find_phases
+
+    shape, series = noisy_box(), simulated_tosses(4, 130)
+    rng = np.random.default_rng(3)
+    vertices = shape.vertices_m.copy()
+    for axis in range(3):
+        for side in (-1.0, 1.0):
+            face = np.flatnonzero(np.abs(vertices[:, axis] * side - EDGES_M[axis] / 2) < 0.004)
+            vertices[rng.choice(face, 6, replace=False), axis] += side * 0.009
+    spiky = replace(shape, vertices_m=vertices)
+    phases = find_phases(series[0], np.eye(3) * 1e-3)
+    assert lowest_point_m(series[0], vertices, phases) < -0.006
+    found = learn_from_tracks(tracks_of(series), spiky, WORLD_FROM_CAMERA, config=QUICK)
+    assert found.model.friction_low <= 0.25 <= found.model.friction_high
+    sunk = Transform("world", "d455", WORLD_FROM_CAMERA.rotation, WORLD_FROM_CAMERA.translation_m - [0, 0, 0.009])
+    with pytest.raises(BadInput, match=r"\d mm below the plane"):
+        learn_from_tracks(tracks_of(series), spiky, sunk, config=QUICK)
+
+
 def test_the_contact_loss_tells_a_wrong_shape_and_wrong_poses(simulated_tosses):
     tracks = tracks_of(simulated_tosses(4, 130))
     model = uniform_model(noisy_box(), uniform_physics(noisy_box()), 0.25, Plane())
