@@ -71,6 +71,7 @@ def intrinsics(path: Path, args: argparse.Namespace, progress: Progress) -> Done
             lenses[name] = calibrate_intrinsics(
                 name, views.sizes[name], views.board[name], args.lens or LENSES, given, args.anew or bool(args.lens)
             )
+        lenses |= _solved_together(session, views, lenses)
         reports = [replace(lens.report, kind=f"intrinsics of {name}") for name, lens in lenses.items()]
         picture = _picture(session, "intrinsics", views, lenses)
         if args.dry_run or any(r.verdict == "refused" for r in reports):
@@ -80,6 +81,32 @@ def intrinsics(path: Path, args: argparse.Namespace, progress: Progress) -> Done
         entries = {**known, **{n: lens.report.to_json() for n, lens in lenses.items()}}
         written = store.write_entry(session, calibration, "intrinsics", entries)
         return done(reports, written, [picture], True)
+
+
+def _solved_together(session: Session, views: BoardViews, lenses: Mapping[str, Lens]) -> dict[str, Lens]:
+    """Lenses that were fitted, solved once more with what the other cameras saw of the same board at the same instants:
+    a single camera hardly tells focal length from distance, several that see one board do."""
+    models = {n: lenses[n].model if n in lenses else session.calibration.cameras.get(n) for n in views.board}
+    known = {n: m for n, m in models.items() if m is not None}
+    fitted = [n for n, lens in lenses.items() if lens.report.details["lens"] != "given"]
+    if not fitted or len(known) < 2:
+        return {}
+    reference = COLOR if COLOR in known else sorted(known)[0]
+    still = views.table if table_target(session.calibration) else None
+    try:
+        placed = calibrate_cameras(known, {n: views.board[n] for n in known}, reference, still, freed=fitted)
+    except BadInput:
+        return {}  # cameras that share no views: each has its own answer
+    return {n: _together_with(lenses[n], placed, n) for n in fitted}
+
+
+def _together_with(lens: Lens, placed: PlacedCameras, name: str) -> Lens:
+    change = 100 * (placed.models[name].fx / lens.model.fx - 1)
+    note = Finding(
+        "note", f"{name}: solved with all cameras' views together, which moved the focal length {change:+.2f} %"
+    )
+    report = replace(lens.report, findings=(*lens.report.findings, note))
+    return replace(lens, model=placed.models[name], report=report)
 
 
 def _picture(session: Session, kind: str, views: BoardViews, solved: Mapping[str, Lens]) -> Path:

@@ -59,14 +59,15 @@ def calibrate_cameras(
     reference: str,
     table: Mapping[str, Sequence[TargetView]] | None = None,
     lenses_free: bool = False,
+    freed: Sequence[str] = (),
 ) -> PlacedCameras:
     """Extrinsics of all cameras from simultaneous views of one rigid board: `views[camera][k]` are of one instant.
 
     `table`: what the same images show of tags fixed to the table (points in the world). They span more than a board
     does, so they give the scale, and the board's own is found: a printer is off by a part in a thousand easily. Tags
     that do not lie where they are said to are left out, and the report says so. `lenses_free`: the lenses are solved
-    with the places, and taken where they explain views kept aside better than the given ones do; `models` of the result
-    holds them.
+    with the places, and taken where they explain views kept aside better than the given ones do; `freed`: those of
+    these cameras are, and are taken in any case. `models` of the result holds them.
     Raises BadInput where the geometry does not connect the cameras, naming those that are cut off.
     """
     names = [reference, *sorted(n for n in models if n != reference)]
@@ -74,12 +75,13 @@ def calibrate_cameras(
     findings, setup = _table_or_not(setup)
     solved, seen, dropped = _without_bad_views(setup.start, setup.observations(setup.start))
     hold_out = _hold_out(setup, solved)
-    if lenses_free:
-        freed = adjust(replace(solved.scene, free_lenses=np.ones(len(names), dtype=bool)), seen)
-        freed_hold_out = _hold_out(setup, freed)
-        given_px, freed_px = hold_out["rms_px"], freed_hold_out["rms_px"]
-        if given_px > AS_GOOD * freed_px:
-            solved, hold_out = freed, freed_hold_out
+    if lenses_free or freed:
+        free = np.isin(names, freed) if freed else np.ones(len(names), dtype=bool)
+        without = adjust(replace(solved.scene, free_lenses=free), seen)
+        hold_out_without = _hold_out(setup, without)
+        given_px, freed_px = hold_out["rms_px"], hold_out_without["rms_px"]
+        if freed or given_px > AS_GOOD * freed_px:
+            solved, hold_out = without, hold_out_without
         else:
             text = f"the given lenses explain views kept aside as well ({given_px:.4f} px) as freed ones"
             findings.append(Finding("note", f"{text} ({freed_px:.4f} px): kept"))
