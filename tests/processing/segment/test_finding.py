@@ -11,16 +11,21 @@ import numpy as np
 import pytest
 
 from processing.cli import main
+from processing.config import Config
+from processing.lost_tosses import without_lost
+from processing.pipeline import start_run
 from processing.segment.background import BackgroundSegmenter
 from processing.segment.candidates import Candidate, CandidateSettings, Finder
 from processing.segment.courses import CourseSettings, Look, choose, free_fall, join
 from processing.segment.follow import BackgroundSettings
 from processing.segment.sighting import FindSettings, courses_of, positions, read_sighting, sightings, write_sightings
 from processing.segment.static_scene import SceneSettings, StaticScene, learn_scene
+from processing.stage import Done
 from recordings.errors import BadInput
 from recordings.progress import Silent
 from recordings.records import RgbdFrame
 from recordings.results import Results
+from recordings.session import Session
 
 DOWN = np.array([0.0, 0.6, 0.8])
 RED, GREEN = np.eye(4096)[3840], np.eye(4096)[240]
@@ -168,6 +173,22 @@ def test_a_toss_without_the_object_is_lost_and_said_and_the_others_go_on(
     tracks = Results.open(out).tracks()
     assert tracks[1].lost.all()
     assert not tracks[0].lost.all()
+
+
+def test_a_toss_whose_masks_hold_no_depth_is_lost_and_one_clear_error_where_all_are(
+    record_tiny: Callable[..., Path], tmp_path: Path
+) -> None:
+    def done(counts: dict[str, Any]) -> Done:
+        return Done(Path("segment-0"), "key", counts, reused=False)
+
+    with Session.open(record_tiny(tosses=(0, 1, 2), frames=2)) as session:
+        run = start_run(session, session.tosses, tmp_path / "out", Config(), "multi-hypothesis", lambda name: Silent())
+    masks = {0: done({"with_depth": True}), 1: done({"with_depth": False}), 2: done({"not_found": True})}
+    kept = without_lost(run, masks)
+    assert (kept.tosses, kept.lost, kept.recorded) == ((0,), (1, 2), (0, 1, 2))
+    assert "toss 1: the object's masks hold no depth: lost" in kept.notes[0]
+    with pytest.raises(BadInput, match="no toss can be tracked.*toss 1: .*no depth"):
+        without_lost(replace(run, tosses=(1, 2)), masks)
 
 
 def test_an_object_in_none_of_the_tosses_is_one_clear_error(
