@@ -99,7 +99,8 @@ class SyntheticConfig:
     """When the RGBD camera's 32-bit microseconds start over (negative: never in a session)."""
     gripper_delay_ms: float = 60.0
     gripper_delay_sigma_ms: float = 6.0
-    board_views: int = 24
+    board_views: int = 48
+    """How often the board is shown to one of the cameras, or the arm holds it up."""
     subframes: int = 1
 
 

@@ -12,7 +12,7 @@ from acquisition.synthetic import textures
 from acquisition.synthetic.objects import box
 from acquisition.synthetic.paint import Gloss, assemble
 from acquisition.synthetic.rays import Body
-from recordings.geometry import Transform, rotation_exp
+from recordings.geometry import CameraModel, Transform, rotation_exp
 from recordings.robot import Robot, panda
 from recordings.tracks import TagPlacement
 
@@ -65,6 +65,22 @@ def board_pose(rng: np.random.Generator) -> Transform:
     tilt = np.deg2rad(rng.uniform(5, 50)) * _direction(rng.uniform(0, 2 * np.pi))
     turn = rotation_exp(tilt) @ rotation_exp(np.array([0.0, 0.0, rng.uniform(-np.pi, np.pi)]))
     return Transform("world", "board", turn, np.array([*rng.uniform(-0.15, 0.15, 2), rng.uniform(0.15, 0.35)]))
+
+
+def board_before(camera: CameraModel, world_from_camera: Transform, cell: int, rng: np.random.Generator) -> Transform:
+    """world_from_board: before a camera, in the given ninth of its picture, tilted somehow, above the table."""
+    row, column = divmod(cell % 9, 3)
+    corners = np.array([[x, y, 0.0] for x in (-0.17, 0.17) for y in (-0.14, 0.14)])
+    while True:
+        shares = (np.array([column, row]) + rng.uniform(0.2, 0.8, 2)) / 3
+        ray = world_from_camera.vectors(camera.rays(shares[None] * [camera.width, camera.height]))[0]
+        place_m = world_from_camera.translation_m + rng.uniform(0.45, 1.0) * ray / np.linalg.norm(ray)
+        upright = _facing(place_m, world_from_camera.translation_m).rotation
+        tilt = rotation_exp(np.deg2rad(rng.uniform(0, 45)) * _direction(rng.uniform(0, 2 * np.pi)))
+        rolled = rotation_exp(np.array([0.0, 0.0, rng.choice([0.0, np.pi]) + rng.normal(0, 0.2)]))
+        pose = Transform("world", "board", upright @ tilt @ rolled, place_m)
+        if pose.points(corners)[:, 2].min() > 0.02:
+            return pose
 
 
 def _direction(angle: float) -> np.ndarray:

@@ -17,7 +17,7 @@ from numpy import ndarray as Array
 
 from acquisition.devices import JointTrajectory
 from acquisition.synthetic.arm import FORWARD_S, OPEN_M, READY_RAD, Swing
-from acquisition.synthetic.board import board_pose, held_board_poses
+from acquisition.synthetic.board import board_before, held_board_poses
 from acquisition.synthetic.cameras import MONO_NAMES
 from acquisition.synthetic.chance import BOARD, generator
 from acquisition.synthetic.config import (
@@ -213,9 +213,12 @@ class Show:
         return self.lab.planner.follow(toss, swing)
 
     def board_views(self, progress: Progress) -> Performance:
-        """The calibration board, held still in one place after the other, seen by all cameras."""
+        """The calibration board, held still in one place after the other, before each camera in turn; all look."""
         rng = generator(self.config.seed, BOARD)
-        return self._views([board_pose(rng) for _ in range(self.config.board_views)], None, progress)
+        views = [self.lab.d455, *self.lab.mono_views[: self.config.mono_cameras]]
+        turns = [divmod(k, len(views)) for k in range(self.config.board_views)]
+        poses = [board_before(views[v].camera, views[v].world_from_camera, 2 * turn, rng) for turn, v in turns]
+        return self._views(poses, None, progress)
 
     def hand_eye_views(self, progress: Progress) -> Performance:
         """The board in the arm's hand, in one pose of the arm after the other. The arm itself is not drawn."""
