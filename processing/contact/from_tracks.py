@@ -16,7 +16,7 @@ from processing.contact.data_checks import check_plane, lowest_point_m
 from processing.contact.evaluate import FIGURE_4_STEPS, Evaluation, evaluate
 from processing.contact.fit import FRICTION, Model, fit_lbfgs
 from processing.contact.fuse import Field, FusionConfig, Readings, Sizes, Surface, likely_sizes, thinned
-from processing.contact.geometry import SCALE_M, FreePoints, hull_mesh
+from processing.contact.geometry import SCALE_M, FreePoints, pieces_mesh
 from processing.contact.inertia import Physics, uniform_physics
 from processing.contact.judge import losses_of, mean_loss_j, series_of, usable
 from processing.contact.learn import (
@@ -261,19 +261,9 @@ def _fused(
 
 def _support_mesh(model: ContactModel, touched: Bool[Array, " v"]) -> ObjectShape:
     """The hulls of a model's pieces as one mesh."""
-    vertices: list[Array] = []
-    faces: list[Array] = []
-    marks: list[Array] = []
-    count = 0
-    for piece in model.pieces:
-        v, f = hull_mesh(model.support_vertices_m[list(piece)])
-        at = np.linalg.norm(model.support_vertices_m[None] - v[:, None], axis=-1).argmin(1)
-        for store, value in ((vertices, v), (faces, f + count), (marks, touched[at])):
-            store.append(value)
-        count += len(v)
-    return ObjectShape(
-        model.object_frame, "contact", np.concatenate(vertices), np.concatenate(faces), None, np.concatenate(marks)
-    )
+    vertices, faces = pieces_mesh(model.support_vertices_m, model.pieces)
+    at = np.linalg.norm(model.support_vertices_m[None] - vertices[:, None], axis=-1).argmin(1)
+    return ObjectShape(model.object_frame, "contact", vertices, faces, None, touched[at])
 
 
 def _document(

@@ -7,6 +7,7 @@ Points are in object axes, relative to the centre of mass of the prior.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, Protocol, runtime_checkable
 
@@ -95,6 +96,14 @@ def sphere(radius_m: float, count: int = 64) -> FreePoints:
     return FreePoints(radius_m * sphere_directions(count), (tuple(range(count)),))
 
 
+def sphere_in_pieces(radius_m: float, count: int = 64) -> FreePoints:
+    """A union of eight convex pieces that starts as a sphere: its octants, each with the middle."""
+    points = np.concatenate([radius_m * sphere_directions(count), np.zeros((1, 3))])
+    octant = (points[:count] > 0) @ [1, 2, 4]
+    groups = tuple((*(int(i) for i in np.flatnonzero(octant == o)), count) for o in range(8))
+    return FreePoints(points, groups)
+
+
 def hull_of(vertices_m: Float[Array, "v 3"], count: int = 64) -> FreePoints:
     """A convex hull of at most `count` points that starts at the hull of given vertices."""
     points = support_points(vertices_m, count)
@@ -144,3 +153,16 @@ def hull_mesh(points_m: Float[Array, "v 3"]) -> tuple[Float[Array, "w 3"], Int[A
 def edges_of_box(parameters: Float[Array, " p"]) -> Float[Array, "3"]:
     """Edge lengths of a Box in metres."""
     return 2 * SCALE_M * np.abs(parameters[:3])
+
+
+def pieces_mesh(
+    points_m: Float[Array, "v 3"], pieces: Sequence[Sequence[int]]
+) -> tuple[Float[Array, "w 3"], Int[Array, "f 3"]]:
+    """The hulls of all pieces as one mesh (they may overlap)."""
+    vertices: list[Array] = []
+    faces: list[Array] = []
+    for piece in pieces:
+        v, f = hull_mesh(points_m[list(piece)])
+        faces.append(f + sum(map(len, vertices)))
+        vertices.append(v)
+    return np.concatenate(vertices), np.concatenate(faces)

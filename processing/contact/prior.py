@@ -2,13 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray as Array
 
-from processing.contact.geometry import Box, FreePoints, Geometry, GeometryName, hull_mesh, hull_of, sphere
+from processing.contact.geometry import (
+    Box,
+    FreePoints,
+    Geometry,
+    GeometryName,
+    hull_mesh,
+    hull_of,
+    pieces_mesh,
+    sphere,
+    sphere_in_pieces,
+)
 from processing.contact.inertia import Physics
 from processing.contact.motion import PoseSeries
 from processing.contact.support import trimmed_hull, trimmed_vertices
@@ -55,9 +66,15 @@ class Prior:
 
 
 def prior_from_size(geometry: GeometryName, side_m: float, center_m: Float[Array, "3"] | None = None) -> Prior:
-    """Start from a cube of a side, or a sphere of 0.8 times that side as radius, about the centre of mass."""
+    """Start from a cube of a side, or a sphere of 0.8 times that side as radius (in eight pieces where the body need
+    not be convex), about the centre of mass."""
     center = np.zeros(3) if center_m is None else np.asarray(center_m, dtype=np.float64)
-    shape: Geometry = Box(np.full(3, side_m / 2)) if geometry == "box" else sphere(0.8 * side_m)
+    makers: dict[GeometryName, Callable[[], Geometry]] = {
+        "box": lambda: Box(np.full(3, side_m / 2)),
+        "hull": lambda: sphere(0.8 * side_m),
+        "nonconvex": lambda: sphere_in_pieces(0.8 * side_m),
+    }
+    shape = makers[geometry]()
     return Prior(shape, Frame(np.eye(3), center), measured=False)
 
 
@@ -117,6 +134,9 @@ def learned_shape(prior: Prior, points_m: Float[Array, "v 3"], touched: Bool[Arr
         return ObjectShape(
             prior.object_frame, "contact", prior.frame.back(moved), mesh.faces, mesh.vertex_rgb, mesh.observed
         )
-    vertices, faces = hull_mesh(points_m)
+    if prior.geometry.name == "nonconvex":
+        vertices, faces = pieces_mesh(points_m, prior.geometry.pieces())
+    else:
+        vertices, faces = hull_mesh(points_m)
     used = np.array([int(np.linalg.norm(points_m - v, axis=1).argmin()) for v in vertices])
     return ObjectShape(prior.object_frame, "contact", prior.frame.back(vertices), faces, None, touched[used])

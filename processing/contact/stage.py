@@ -85,7 +85,7 @@ def run_stage(
             "not_learned_from": list(marked),
             "without_poses": missing,
             "plane": {"offset_m": plane.offset_m, "normal": plane.normal_world.tolist(), "source": plane.source},
-            "warnings": warnings_of(learning),
+            "warnings": [*warnings_of(learning), *_unmeasured(geometry, source)],
             "seconds": time.perf_counter() - began,
             "cpu_seconds_total": time.process_time(),
             **extra,
@@ -193,6 +193,15 @@ def _digest(tracks: Mapping[int, PoseSeries], learned: Sequence[int], tested: Se
     return content.hexdigest()
 
 
+def _unmeasured(geometry: str | None, source: PoseSource) -> list[str]:
+    if geometry != "nonconvex" or source.shape is not None:
+        return []
+    return [
+        "nonconvex without a shape to start from: a plane only ever touches the convex hull, so what lies between the "
+        "touched points is the start's, not measured; run vision first (`toss-process SESSION`) for a shape"
+    ]
+
+
 def session_plane(session: Session) -> Plane:
     """The table that the session was calibrated with (`toss-calibrate table`); z = 0 of `world` where none is given."""
     return calibrated_plane(session.calibration)
@@ -268,12 +277,6 @@ def make_prior(
     if source.shape is not None and init_m is None:
         physics = shape_physics(source.shape, given)
         return prior_from_shape("box", source.shape, physics, cap_m2=CAP_M2), physics
-    if geometry == "nonconvex":
-        raise BadInput(
-            "--geometry nonconvex needs a shape to start from (where contact never reaches, it stands); these "
-            "poses come "
-            "without one: run vision first (`toss-process SESSION`), or use --geometry hull"
-        )
     side = resting_side_m(tracks, plane) if init_m is None else init_m
     physics = given or uniform_box_physics(np.full(3, side))
     prior = prior_from_size(geometry or "box", side, physics.center_of_mass_m)  # type: ignore[arg-type]

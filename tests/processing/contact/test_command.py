@@ -85,7 +85,6 @@ def test_the_imported_poses_are_the_track(poses_session, tmp_path):
         ({"steps": 0}, "at least 1"),
         ({"init_m": 50.0}, "metres"),
         ({"poses": "truth"}, "toss-truth"),
-        ({"geometry": "nonconvex"}, "needs a shape to start from"),
     ],
 )
 def test_bad_arguments_say_what_was_wanted(poses_session, tmp_path, options, words):

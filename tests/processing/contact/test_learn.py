@@ -234,6 +234,20 @@ def test_a_mesh_is_carried_along_and_keeps_its_notch():
     np.testing.assert_allclose(moved, shape.vertices_m * [1.1, 1.0, 1.0], atol=1e-6)
 
 
+def test_a_body_of_pieces_may_start_from_a_size_alone(simulated_tosses, box_physics):
+    """Eight octants of a sphere with the middle: what a hull learns, they learn, and the middle stays."""
+    config = replace(QUICK, fit=FitConfig(adam_iterations=30))
+    pieces, hull = (
+        learn_contact(simulated_tosses(3), prior_from_size(name, 0.05), box_physics, config=config)
+        for name in ("nonconvex", "hull")
+    )
+    assert (pieces.geometry, len(pieces.model.pieces)) == ("nonconvex", 8)
+    assert 64 in pieces.untouched_vertices  # the middle
+    np.testing.assert_allclose(pieces.model.support_vertices_m[:64], hull.model.support_vertices_m, atol=1e-6)
+    assert pieces.friction.value == pytest.approx(hull.friction.value, rel=1e-4)
+    assert pieces.shape.faces.max() == len(pieces.shape.vertices_m) - 1
+
+
 def test_support_points_of_a_fine_mesh_keep_its_hull():
     points = hull_of(sphere(0.05, 4000).points_m, 64).points_m
     assert len(points) == 64
