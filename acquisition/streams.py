@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from typing import Generic, Literal, TypeVar
 
 T = TypeVar("T")
-LOOPS, READS, WRITES = -15, -10, -5
+LOOPS, READS, WRITES = -18, -15, -11
 """How nice to other programs are: control loops of arms, threads that read devices, those that encode and write."""
 Cause = Literal["queue full", "duplicate", "out of order", "invalid", "write failed", "too late"]
 

@@ -35,6 +35,8 @@ NEW_TURN_RAD = 0.17
 STANDS_RAD, STANDS_NS = 0.002, 10_000_000
 POLL_S = 0.3
 LONGEST_S = 1800.0
+ROUNDS = 2
+"""How often the simulated lab shows its views."""
 FEWEST_POINTS = 8
 
 
@@ -100,7 +102,7 @@ def record_views(
     kept: list[dict[str, TargetView]] = []
     poses: list[Float[Array, " j"]] = []
     before: Float[Array, " j"] | None = None
-    ends = time.monotonic() + LONGEST_S
+    ends, rounds = time.monotonic() + LONGEST_S, 0
     with interrupts.shield():
         writer = session.calibration_views()
     if setup.lab is not None:
@@ -111,7 +113,10 @@ def record_views(
             if operator.key() in ("stop", "quit") or time.monotonic() > ends:
                 break
             if setup.lab is not None and setup.lab.stage.over():
-                break
+                rounds += 1
+                if rounds == ROUNDS:
+                    break
+                setup.lab.show_views_again()
             images = _images(recorder, covered)
             seen = _views(target, images)
             still = bool(seen) and all(n in last and _moved_px(seen[n], last[n]) < STILL_PX for n in seen)

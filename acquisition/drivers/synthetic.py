@@ -125,6 +125,11 @@ class SyntheticLab:
             raise RuntimeError("no views were set up")
         self.arm.move(trajectory)
 
+    def show_views_again(self) -> None:
+        """The same views from the beginning: a busy machine may have missed some."""
+        self.stage.set_up(self.stage.shown[-1].performance)
+        self.show_views()
+
     def faults(self, device: str) -> Faults:
         """The faults of a device, to inject some."""
         return self._faults.setdefault(device, Faults(FAULTS))

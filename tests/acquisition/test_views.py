@@ -88,7 +88,7 @@ def test_views_of_the_simulated_board_are_recorded_and_what_is_missing_is_said(
 @pytest.mark.slow
 def test_the_simulated_arm_s_views_find_its_base(tmp_path: Path) -> None:
     rig, out = tmp_path / "rig.toml", tmp_path / "out"
-    rig.write_text(RIG.replace("board_views = 3", "board_views = 12"))
+    rig.write_text(RIG.replace("board_views = 3", "board_views = 8"))
     assert main(["--rig", str(rig), "--calibration", "hand-eye", "--yes", str(out)]) == 1  # fewer than 20
     assert calibrate(["hand-eye", str(out)]) == 0
     lab = set_up(str(rig)).lab
