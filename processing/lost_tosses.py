@@ -22,6 +22,7 @@ def without_lost(run: Run, masks: Mapping[int, Done]) -> Run:
 
     Raises BadInput where no toss is left.
     """
+    run = replace(run, notes=(*run.notes, *_elsewhere(run, masks)))
     why = {t: reason for t in run.tosses if (reason := _why_lost(masks[t].counts)) is not None}
     if not why:
         return run
@@ -31,6 +32,17 @@ def without_lost(run: Run, masks: Mapping[int, Done]) -> Run:
     notes = tuple(f"toss {t}: {reason}: lost, and left out of everything else" for t, reason in why.items())
     kept = tuple(t for t in run.tosses if t not in why)
     return replace(run, tosses=kept, lost=tuple(why), notes=(*run.notes, *notes))
+
+
+def _elsewhere(run: Run, masks: Mapping[int, Done]) -> list[str]:
+    """Frames that were left out because the object jumps between them and the toss."""
+    spans = {t: masks[t].counts.get("elsewhere", []) for t in run.tosses}
+    return [
+        f"toss {t}: in frames {first}-{last} the object is at a place from which no motion leads into the toss "
+        "(recorded before it began, or after it): left out"
+        for t, found in spans.items()
+        for first, last in found
+    ]
 
 
 def _why_lost(counts: Counts) -> str | None:

@@ -34,6 +34,10 @@ class FindSettings:
     """A course that falls so clearly is looked at in every frame of its fall."""
     again: float = 0.3
     """Another course looks so much like the object (-1..1) that it is the object, seen before or after a gap."""
+    jump_m: float = 0.15
+    jump_m_s2: float = 15.0
+    """No motion leads over a gap that is wider than this, after the velocities on both sides are taken out, and needs
+    such an acceleration: the frames on the other side were recorded before the toss began, or after it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +51,8 @@ class Sighting:
     spans: Mapping[int, tuple[int, int]]
     shares: Float[Array, " n"]
     score: float
+    elsewhere: tuple[tuple[int, int], ...] = ()
+    """First and last frames in which it is seen at a place that no motion leads from or to: not a part of the toss."""
 
     @property
     def again(self) -> list[int]:
@@ -55,7 +61,7 @@ class Sighting:
 
     def belongs_to(self, start: int, count: int) -> set[int]:
         """The frames, of so many, that no other course than that of `start` covers."""
-        others = [span for i, span in self.spans.items() if i != start]
+        others = [span for i, span in self.spans.items() if i != start] + list(self.elsewhere)
         return set(range(count)) - {i for first, last in others for i in range(first, last + 1)}
 
 
@@ -114,9 +120,11 @@ def sightings(
         first = clearest(course)
         others = [c for c in courses[toss] if c is not course and apart(c, course) and alike(c, look) > s.again]
         seen = {clearest(c).position: c for c in others} | {first.position: course}
+        jumped = tuple(_span(c) for c in seen.values() if c is not course and not leads_to(course, c, s))
+        seen = {i: c for i, c in seen.items() if _span(c) not in jumped}
         masks = {i: clearest(c).picture(shape, stride) for i, c in seen.items()}
-        spans = {i: (c.seen[0].position, c.seen[-1].position) for i, c in seen.items()}
-        found[toss] = Sighting(first.position, masks, spans, look.shares, score)
+        spans = {i: _span(c) for i, c in seen.items()}
+        found[toss] = Sighting(first.position, masks, spans, look.shares, score, jumped)
     return found
 
 
@@ -128,9 +136,28 @@ def look_of(example: Example, camera: CameraModel) -> Look:
     return Look(color_shares(example.frame.color_rgb, example.mask), size)
 
 
+def _span(course: Course) -> tuple[int, int]:
+    return course.seen[0].position, course.seen[-1].position
+
+
 def apart(a: Course, b: Course) -> bool:
     """Whether two courses share no time."""
     return a.seen[-1].position < b.seen[0].position or b.seen[-1].position < a.seen[0].position
+
+
+def leads_to(a: Course, b: Course, s: FindSettings) -> bool:
+    """Whether some motion connects two courses: an object does not jump."""
+    first, second = (a, b) if a.seen[0].position < b.seen[0].position else (b, a)
+    last, next_ = first.seen[-1], second.seen[0]
+    passed_s = next_.time_s - last.time_s
+    velocity = 0.5 * (_velocity(first.seen[-3:]) + _velocity(second.seen[:3]))
+    gap_m = float(np.linalg.norm(next_.center_m - last.center_m - velocity * passed_s))
+    return gap_m < s.jump_m or 4 * gap_m / passed_s**2 < s.jump_m_s2
+
+
+def _velocity(seen: Sequence[Candidate]) -> Float[Array, "3"]:
+    passed_s = seen[-1].time_s - seen[0].time_s
+    return (seen[-1].center_m - seen[0].center_m) / passed_s if passed_s > 0 else np.zeros(3)
 
 
 def clearest(course: Course) -> Candidate:
@@ -152,6 +179,7 @@ def write_sightings(folder: Path, found: Mapping[int, Sighting]) -> None:
     for toss, sighting in found.items():
         spans = {str(i): list(span) for i, span in sighting.spans.items()}
         document[str(toss)] = {"start": sighting.start, "score": round(sighting.score, 3), "spans": spans}
+        document[str(toss)]["elsewhere"] = [list(span) for span in sighting.elsewhere]
         (folder / f"toss_{toss:02d}").mkdir()
         for position, mask in sighting.masks.items():
             cv2.imwrite(str(folder / f"toss_{toss:02d}" / f"{position:06d}.png"), mask.astype(np.uint8) * 255)
@@ -169,4 +197,5 @@ def read_sighting(folder: Path, toss: int) -> Sighting | None:
     masks = {int(f.stem): np.asarray(np.asarray(cv2.imread(str(f), cv2.IMREAD_GRAYSCALE)) > 0) for f in files}
     shares = np.load(folder / "shares.npy", allow_pickle=False)
     spans = {int(i): (int(first), int(last)) for i, (first, last) in told["spans"].items()}
-    return Sighting(int(told["start"]), masks, spans, shares, float(told["score"]))
+    elsewhere = tuple((int(first), int(last)) for first, last in told["elsewhere"])
+    return Sighting(int(told["start"]), masks, spans, shares, float(told["score"]), elsewhere)
