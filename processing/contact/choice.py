@@ -15,7 +15,7 @@ from processing.contact.fuse import Surface
 from processing.contact.geometry import SCALE_M
 from processing.contact.inertia import Physics
 from processing.contact.judge import losses_of
-from processing.contact.learn import ContactConfig, learn_contact, penetration_of
+from processing.contact.learn import ContactConfig, learn_contact
 from processing.contact.loss import Weights
 from processing.contact.motion import PoseSeries
 from processing.contact.plane import Plane
@@ -109,11 +109,10 @@ def _tested_choice(
     empty: float,
 ) -> GeometryChoice:
     """Learn both on every second toss with few iterations, and compare the contact loss of the others."""
-    penetration = penetration_of(config, series)
     quick = replace(
         config,
         bootstrap_repeats=0,
-        weights=config.weights or Weights(dissipation=config.one_toss_dissipation, penetration=penetration),
+        weights=config.weights or Weights(dissipation=config.one_toss_dissipation, penetration=config.penetration),
         fit=replace(config.fit, adam_iterations=60),
     )
     learned, held_out = series[::2], series[1::2]

@@ -1,12 +1,10 @@
 """How sure the learned numbers are: a bootstrap over tosses, or the loss's curvature where there is one toss only.
 
-Bootstrap: tosses are drawn with replacement, the fit is repeated from the optimum with those weights; the interval
-is the
-optimum -+ t * standard deviation of the repeats.
+Bootstrap: tosses are drawn with replacement, the fit is repeated from the optimum with those weights; the interval is
+the optimum -+ t * standard deviation of the repeats; friction's is widened by what the model leaves.
 Curvature: in four directions (friction, and stretching the object along each axis) the loss of every transition is
-differenced. With H the mean Hessian and G the variance of the mean gradient, summed over neighbouring frames
-because one
-contact lasts several (Newey and West 1987), the covariance is H^-1 G H^-1 (White 1982), bounded by a wide prior.
+differenced. With H the mean Hessian and G the variance of the mean gradient, summed over neighbouring frames because
+one contact lasts several (Newey and West 1987), the covariance is H^-1 G H^-1 (White 1982), bounded by a wide prior.
 """
 
 from __future__ import annotations
@@ -36,6 +34,11 @@ MODEL_FRICTION, MODEL_SIZE = 0.015, 0.12
 of the
 plane, corners that never touched): the spread of single real tosses beyond their curvature, tools/bench_contact.py
 one."""
+
+
+MODEL_SHARE = 0.07
+"""Standard deviation of friction, relative, that stays with any number of tosses, because a step of the model is not
+the world (a rebound, several contacts in one step): the spread over simulated bodies beyond their bootstrap."""
 
 
 @dataclass(frozen=True)
@@ -94,7 +97,7 @@ def bootstrap(
     points = np.array([model.geometry.points(torch.as_tensor(v[SHAPE])).numpy() for v in values])
     return Spread(
         "bootstrap over tosses",
-        width * float((values[:, FRICTION] ** 2).std(ddof=1)),
+        float(np.hypot(width * (values[:, FRICTION] ** 2).std(ddof=1), 1.96 * MODEL_SHARE * optimum[FRICTION] ** 2)),
         width * np.array([extents(p) for p in points]).std(axis=0, ddof=1),
         width * points.std(axis=0, ddof=1),
         width * SCALE_M * values[:, -4:-1].std(axis=0, ddof=1),
