@@ -123,9 +123,9 @@ class Followed:
     rejected: dict[int, list[Candidate]]
 
 
-def rows(schedule: Schedule, distance_m: float) -> Float[Array, "r 6"]:
+def rows(schedule: Schedule, distance_m: float, round_body: bool = False) -> Float[Array, "r 7"]:
     """The schedule's scales for an object at this distance: stereo depth errors grow with its square."""
-    out = np.array(schedule, dtype=np.float64)
+    out = np.concatenate([np.array(schedule, dtype=np.float64), np.full((len(schedule), 1), float(round_body))], 1)
     ratio = distance_m / USUAL_DISTANCE_M
     out[:, k.GEOMETRY_M] *= np.clip(ratio**2, 0.5, 4.0)
     out[:, k.OUTLINE_M] *= np.clip(ratio, 0.5, 2.0)

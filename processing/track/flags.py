@@ -30,8 +30,9 @@ class FlagConfig:
     sensor's fixed pattern). From the normalised errors on simulated variety."""
     rival_cost: float = 0.0015
     """Another story of the same frames that fits worse by this much counts half as evidence of doubt."""
-    unsure_deg: float = 25.0
-    """A pose whose rotation may be off by more than this (standard deviation) is a guess: marked as interpolated."""
+    unsure_deg: float = 15.0
+    """A pose whose rotation may be off by more than this (standard deviation) is a guess, marked as interpolated: a
+    flip (45 degrees) lies within three of them."""
 
 
 def per_view(pairs: Int[Array, "m 2"], figures: Float[Array, "m 3"], n: int) -> tuple[Array, Array]:

@@ -50,6 +50,8 @@ class GraphConfig:
     still_rad: float = 0.003
     still_m: float = 0.0002
     """What a body that stands still may move between frames (standard deviation)."""
+    round_body: bool = False
+    """Surfaces that turn away from the camera and brightness count little: on a round body they stay with the view."""
     shared_noise: float = 8.0
     """A view's pairs share its noise: together they count as one, so many times over."""
 
@@ -118,8 +120,10 @@ def refine(
     fixed: Bool[Array, " n"],
     motion: Motion,
     config: GraphConfig,
+    held: Float[Array, "6"] | None = None,
 ) -> Refined:
-    """All poses in `use` at once; those in `fixed` stay. `poses` of other views are returned as they are."""
+    """All poses in `use` at once; those in `fixed` stay. `poses` of other views are returned as they are. No pose moves
+    along the twist `held`, where there is one."""
     poses = poses.copy()
     pairs = choose_pairs(poses, use, motion.toss, motion.center_m, config)
     pairs = pairs[~fixed[pairs].all(1)]
@@ -129,9 +133,11 @@ def refine(
     place[free] = np.arange(len(free))
     figures = np.zeros((len(pairs), 3))
     H = np.eye(6 * len(free))
-    for row in rows(config.schedule, distance):
+    for row in rows(config.schedule, distance, config.round_body):
         for _ in range(int(row[k.STEPS])):
             H, g, figures = _normal_equations(store, poses, use, pairs, place, row, motion, config)
+            if held is not None:
+                _hold(H, held)
             step = -np.linalg.solve(H + np.diag(1e-6 * np.diag(H) + 1e-9), g).reshape(-1, 6)
             for i, twist in zip(free, step):
                 size = max(np.linalg.norm(twist[:3]) / 0.03, np.linalg.norm(twist[3:]) / 0.2, 1.0)
@@ -141,9 +147,16 @@ def refine(
     return Refined(poses, _covariances(H, free, len(poses)), pairs, figures)
 
 
+def _hold(H: Float[Array, "f f"], held: Float[Array, "6"]) -> None:
+    """Takes one twist of the object frame out of every view's freedom."""
+    stiff = 1e3 * np.trace(H) / max(len(H), 1) * np.outer(held, held) / float(held @ held)
+    for a in range(0, len(H), 6):
+        H[a : a + 6, a : a + 6] += stiff
+
+
 def _normal_equations(
     store: ViewStore, poses: Float[Array, "n 4 4"], use: Bool[Array, " n"], pairs: Int[Array, "m 2"],
-    place: Int[Array, " n"], row: Float[Array, "6"], motion: Motion, config: GraphConfig,
+    place: Int[Array, " n"], row: Float[Array, "7"], motion: Motion, config: GraphConfig,
 ) -> tuple[Float[Array, "f f"], Float[Array, " f"], Float[Array, "m 3"]]:  # fmt: skip
     count = int(place.max()) + 1
     blocks, gradients = np.zeros((len(pairs), 6, 6)), np.zeros((len(pairs), 6))

@@ -32,11 +32,13 @@ PX, PY, PZ, SNX, SNY, SNZ, SSHARP = range(7)
 SAMPLE = 6 + 2 * LOOKS
 """Columns of a sample: point and normal in its camera's frame (m), then its looks: LOOKS sharp, LOOKS smooth."""
 
-LEVEL, STEPS, GEOMETRY_M, INTENSITY, OUTLINE_M, SHARE = range(6)
+LEVEL, STEPS, GEOMETRY_M, INTENSITY, OUTLINE_M, SHARE, ROUND = range(7)
 """Columns of a schedule row: intensity channel (0 sharp, 1 smooth), steps, the three scales, share of the samples."""
 
 LEAST_SLOPE = 0.03
 """Looks that change by less a pixel are shading, which stays with the room: they pull little."""
+LEAST_BRIGHT_SLOPE = 0.1
+GRAZING, FACING = 0.3, 0.8
 COVERED_COST = 0.12
 """Of a point that faces the other view but lies behind what is seen there: it may be covered."""
 ODD_COST = 0.4
@@ -132,7 +134,7 @@ def fit_surface(depth_m, inside, rays, radius, edge_share, out_m, normals):  # n
 
 @no_type_check
 @njit(cache=True, nogil=True, fastmath=True)
-def pair_terms(samples, step, pose, maps, row, focal, center, level, s_geo, s_int, s_out, H, g):  # noqa: C901
+def pair_terms(samples, step, pose, maps, row, focal, center, level, s_geo, s_int, s_out, round_body, H, g):  # noqa: C901
     """Adds normal equations of `samples` (of one camera) seen by another view, in that view's camera frame.
 
     pose: 4x4 other_from_sample_camera. H (6, 6), g (6): J^T W J and J^T W r for a twist (translation, rotation) of the
@@ -192,6 +194,7 @@ def pair_terms(samples, step, pose, maps, row, focal, center, level, s_geo, s_in
         nx, ny, nz = maps[near, NX], maps[near, NY], maps[near, NZ]
         fits = False
         facing = 0.0
+        trust = 1.0
         if zr <= 0.0:
             cost += 0.5 * COVERED_COST
             fits = True
@@ -218,6 +221,11 @@ def pair_terms(samples, step, pose, maps, row, focal, center, level, s_geo, s_in
                 fits = True
                 on += 1
                 k = 1.0 - r * r / 9.0
+                if round_body:
+                    far = 1.0 / np.sqrt(x * x + y * y + z * z)
+                    trust = -max(mx * x + my * y + mz * z, nx * x + ny * y + nz * z) * far
+                    trust = min(max((trust - GRAZING) / (FACING - GRAZING), 0.0), 1.0)
+                    k *= np.sqrt(trust)
                 J[0], J[1], J[2] = nx, ny, nz
                 _add(J, x, y, z, r_m, wg * k * k, H, g)
                 cost += 0.5 * min(r * r / 9.0, 1.0)
@@ -246,7 +254,8 @@ def pair_terms(samples, step, pose, maps, row, focal, center, level, s_geo, s_in
                     gu = (i10 - i00) * (1 - b) + (i11 - i01) * b
                     gv = bottom - top
                     slope = gu * gu + gv * gv
-                    k = (1.0 - r * r / 9.0) * slope / (slope + LEAST_SLOPE * LEAST_SLOPE)
+                    least = LEAST_BRIGHT_SLOPE if round_body and c == 0 else LEAST_SLOPE
+                    k = np.sqrt(trust) * (1.0 - r * r / 9.0) * slope / (slope + least * least)
                     gu *= fx * iz
                     gv *= fy * iz
                     J[0], J[1] = gu, gv
@@ -337,7 +346,7 @@ def view_terms(pose, view, refs, ref_poses, maps, samples, table, focal, center,
         h6[:], g6[:] = 0.0, 0.0
         c, s, o, v = pair_terms(
             mine, step, ref_pose @ back, maps, other, focal, center, level, row[GEOMETRY_M], row[INTENSITY],
-            row[OUTLINE_M], h6, g6,
+            row[OUTLINE_M], row[ROUND] > 0.5, h6, g6,
         )  # fmt: skip
         to_object(h6, g6, ref_pose, 1.0, H, g)
         cost, seen, on, against = cost + c, seen + s, on + o, against + v
@@ -345,7 +354,7 @@ def view_terms(pose, view, refs, ref_poses, maps, samples, table, focal, center,
         h6[:], g6[:] = 0.0, 0.0
         c, s, o, v = pair_terms(
             theirs, 2 * step, pose @ inverse(ref_pose), maps, table[view], focal, center, level, row[GEOMETRY_M],
-            row[INTENSITY], row[OUTLINE_M], h6, g6,
+            row[INTENSITY], row[OUTLINE_M], row[ROUND] > 0.5, h6, g6,
         )  # fmt: skip
         to_object(h6, g6, pose, -1.0, H, g)
         cost, seen, on, against = cost + c, seen + s, on + o, against + v
@@ -420,7 +429,7 @@ def graph_terms(poses, pairs, maps, samples, table, focal, center, row, blocks, 
         mine = samples[table[i, FIRST] : table[i, FIRST] + table[i, COUNT]]
         c, s, o, v = pair_terms(
             mine, step, poses[k] @ inverse(poses[i]), maps, table[k], focal, center, level, row[GEOMETRY_M],
-            row[INTENSITY], row[OUTLINE_M], h6, g6,
+            row[INTENSITY], row[OUTLINE_M], row[ROUND] > 0.5, h6, g6,
         )  # fmt: skip
         blocks[m], gradients[m] = 0.0, 0.0
         to_object(h6, g6, poses[k], 1.0, blocks[m], gradients[m])

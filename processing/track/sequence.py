@@ -330,6 +330,9 @@ def _told(
     lost = ~best.use | (cost > config.flags.tracked_cost)
     lost[first] &= not best.fixed[first]
     twists = config.flags.correlated * joint.covariance[:n]
+    if best.turned is not None:
+        twist = best.turned.axis.twist
+        twists = twists + best.turned.sigma_rad[:, None, None] ** 2 * np.outer(twist, twist)
     for other in stories[1:]:
         apart = other.badness - best.badness
         twists = twists + doubt(joint.poses[:n], other.joint.poses[:n], apart, config.flags)

@@ -14,6 +14,8 @@ from processing.track.flags import per_view
 from processing.track.graph import GraphConfig, Motion, Refined, refine, steady_motion
 from processing.track.middle import center_of_mass
 from processing.track.motion import MotionConfig, change_cost, turn_between
+from processing.track.round_axis import Axis, open_axis
+from processing.track.turns import TurnConfig, Turned, contradiction, doubted, turned
 
 
 @dataclass(frozen=True)
@@ -26,11 +28,19 @@ class StoryConfig:
     agreeing_deg: float = 4.0
     """Two stories of the same frames that differ by less are one."""
     motion: MotionConfig = field(default_factory=MotionConfig)
+    turns: TurnConfig = field(default_factory=TurnConfig)
+    round_body: GraphConfig = field(default_factory=lambda: GraphConfig(round_body=True))
+    """Refinement of a round body whose looks do not tell its turn."""
+    freed: float = 0.98
+    """That refinement may change the turns that were found where what speaks against them falls below this share ..."""
+    shown: float = 0.9
+    """... or where so many views show what is off the round body."""
 
 
 @dataclass(frozen=True, eq=False)
 class Story:
-    """One story after joint refinement. `badness`: mean cost of the views and of the changes of motion."""
+    """One story after joint refinement. `badness`: mean cost of the views and of the changes of motion; `turned`: how
+    a round body's turn about its axis was found."""
 
     told: Hypothesis
     use: Bool[Array, " n"]
@@ -39,20 +49,44 @@ class Story:
     center_m: Float[Array, "3"]
     motion: Motion
     badness: float
+    turned: Turned | None = None
 
 
 def settled(scene: Scene, stories: list[Hypothesis], first: int, keep_first: bool, config: StoryConfig) -> list[Story]:
-    """The stories after joint refinement, best first. Where they agree the first will do; where they do not, the images
-    leave a turn open (that of a mug about its axis), and a refinement that trusts steady motion first is tried too."""
+    """The stories after joint refinement, best first. Where they agree the first will do, unless the body is round and
+    all its frames together say another turn about its axis. Where they do not agree, the images leave some turn open,
+    and a refinement that trusts steady motion first is tried too."""
     n = len(scene.times_s)
     apart = max((apart_deg(stories[0].poses[:n], s.poses[:n]) for s in stories[1:]), default=0.0)
-    if apart < config.agreeing_deg:
-        return _again([refined(scene, stories[0], first, keep_first, config)], scene, first, keep_first, config)
-    steady = replace(config, graph=config.steady)
-    out = sorted((refined(scene, s, first, keep_first, config) for s in stories), key=lambda s: s.badness)
-    smooth = refined(scene, replace(out[0].told, poses=out[0].joint.poses), first, keep_first, steady)
-    out.append(refined(scene, replace(smooth.told, poses=smooth.joint.poses), first, keep_first, config))
+    agree = apart < config.agreeing_deg
+    out = [refined(scene, s, first, keep_first, config) for s in (stories[:1] if agree else stories)]
+    out.sort(key=lambda s: s.badness)
+    sought = _sought(scene, out, first, keep_first, config) if len(stories) > 1 else None
+    if sought is not None:
+        return _again([sought], scene, first, keep_first, replace(config, graph=config.round_body))
+    if not agree:
+        steady = replace(config, graph=config.steady)
+        smooth = refined(scene, replace(out[0].told, poses=out[0].joint.poses), first, keep_first, steady)
+        out.append(refined(scene, replace(smooth.told, poses=smooth.joint.poses), first, keep_first, config))
     return _again(sorted(out, key=lambda s: s.badness), scene, first, keep_first, config)
+
+
+def _sought(scene: Scene, stories: list[Story], first: int, keep_first: bool, config: StoryConfig) -> Story | None:
+    """A round body's story with the turns that all frames together say; None where the stories say the same."""
+    n, best = len(scene.times_s), stories[0]
+    axis = open_axis(scene, best.joint.poses[:n], best.use, config.turns.axis)
+    if axis is None or len(scene.store) > n:
+        return None
+    rivals = [s.joint.poses[:n] for s in stories[1:]]
+    found = turned(scene, best.joint.poses[:n], rivals, best.use, first, axis, config.turns)
+    if len(stories) == 1 and apart_deg(best.joint.poses[:n], found.poses) < config.agreeing_deg:
+        return None
+    told, easy = replace(best.told, poses=found.poses), replace(config, graph=config.round_body)
+    both = [refined(scene, told, first, keep_first, easy, a) for a in (axis, None)]
+    held, free = (contradiction(scene, s.joint.poses[:n], s.use, axis, config.turns) for s in both)
+    sure = free < config.freed * held or found.shown > config.shown
+    kept, said = (both[1], free) if sure else (both[0], held)
+    return replace(kept, turned=doubted(found, said, first, config.turns))
 
 
 def _again(stories: list[Story], scene: Scene, first: int, keep_first: bool, config: StoryConfig) -> list[Story]:
@@ -60,7 +94,9 @@ def _again(stories: list[Story], scene: Scene, first: int, keep_first: bool, con
     if not _delayed(scene):
         return stories
     best = replace(stories[0].told, poses=stories[0].joint.poses)
-    return [refined(scene, best, first, keep_first, config), *stories[1:]]
+    found = stories[0].turned
+    again = refined(scene, best, first, keep_first, config, None if found is None else found.axis)
+    return [replace(again, turned=found), *stories[1:]]
 
 
 def _delayed(scene: Scene) -> bool:
@@ -74,8 +110,11 @@ def apart_deg(one: Float[Array, "n 4 4"], other: Float[Array, "n 4 4"]) -> float
     return float(np.degrees(max(turns, default=0.0)))
 
 
-def refined(scene: Scene, best: Hypothesis, first: int, keep_first: bool, config: StoryConfig) -> Story:
-    """Joint refinement of all tracked views, depth moved to colour's exposure by the story's own motion."""
+def refined(
+    scene: Scene, best: Hypothesis, first: int, keep_first: bool, config: StoryConfig, axis: Axis | None = None
+) -> Story:
+    """Joint refinement of all tracked views, depth moved to colour's exposure by the story's own motion; turns about
+    `axis` stay, where there is one."""
     n, all_views = len(scene.times_s), len(scene.store)
     use = np.isfinite(best.poses[:n, 0, 0])
     fixed = np.arange(all_views) >= n
@@ -90,7 +129,15 @@ def refined(scene: Scene, best: Hypothesis, first: int, keep_first: bool, config
         use = use & put_at_color_times(scene, poses[:n], use)
     center_m = center_of_mass(poses[:n], use, scene)
     motion = Motion(times_s, whose, scene.gravity_camera_m_s2, center_m, still)
-    joint = refine(scene.store, poses, np.concatenate([use, drawn]), fixed, motion, config.graph)
+    joint = refine(
+        scene.store,
+        poses,
+        np.concatenate([use, drawn]),
+        fixed,
+        motion,
+        config.graph,
+        None if axis is None else axis.twist,
+    )
     fit = np.nanmean(per_view(joint.pairs, joint.figures, all_views)[0][:n]) if len(joint.pairs) else 0.0
     price = mean_price(joint.poses[:n], use, scene, center_m, config.motion)
     return Story(best, use, fixed, joint, center_m, motion, float(fit + price))
