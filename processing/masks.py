@@ -142,7 +142,7 @@ def finding(run: Run, scene: Done, rig: Done) -> Done:
     inputs = {"scene": scene.key, "rig": rig.key, "calibration": run.keys["calibration"]}
     inputs |= {f"toss_{t:02d}": run.keys[f"toss_{t:02d}"] for t in run.recorded}
     config = {"given_masks": run.config.given_masks, **asdict(run.config.find)}
-    return run.store.run("find", 3, config, inputs, lambda folder: _find(run, scene, rig, folder))
+    return run.store.run("find", 4, config, inputs, lambda folder: _find(run, scene, rig, folder))
 
 
 def _find(run: Run, scene: Done, rig: Done, folder: Path) -> Counts:

@@ -120,11 +120,12 @@ def sightings(
         first = clearest(course)
         others = [c for c in courses[toss] if c is not course and apart(c, course) and alike(c, look) > s.again]
         seen = {clearest(c).position: c for c in others} | {first.position: course}
-        jumped = tuple(_span(c) for c in seen.values() if c is not course and not leads_to(course, c, s))
-        seen = {i: c for i, c in seen.items() if _span(c) not in jumped}
+        jumped = [c for c in seen.values() if c is not course and not leads_to(course, c, s)]
+        seen = {i: c for i, c in seen.items() if c not in jumped}
+        elsewhere = tuple(_up_to(c, course) for c in jumped)
         masks = {i: clearest(c).picture(shape, stride) for i, c in seen.items()}
         spans = {i: _span(c) for i, c in seen.items()}
-        found[toss] = Sighting(first.position, masks, spans, look.shares, score, jumped)
+        found[toss] = Sighting(first.position, masks, spans, look.shares, score, elsewhere)
     return found
 
 
@@ -138,6 +139,12 @@ def look_of(example: Example, camera: CameraModel) -> Look:
 
 def _span(course: Course) -> tuple[int, int]:
     return course.seen[0].position, course.seen[-1].position
+
+
+def _up_to(away: Course, course: Course) -> tuple[int, int]:
+    """The frames of a course and those between it and another: the object jumped in one of them."""
+    (first, last), (begins, ends) = _span(away), _span(course)
+    return (first, begins - 1) if last < begins else (ends + 1, last)
 
 
 def apart(a: Course, b: Course) -> bool:
