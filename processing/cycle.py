@@ -63,8 +63,6 @@ class Pass:
 
 def run_cycle(run: Run, variant: Variant, start: Pass, name: str) -> Pass:
     """A row of the table from its first pass on."""
-    if variant.refined == "converged":
-        return _until_converged(run, start, name)
     if variant.refined == "joint":
         return _joint(run, start, name)
     refined = with_contact(run, start, name) if variant.contact else start
@@ -76,7 +74,8 @@ def run_cycle(run: Run, variant: Variant, start: Pass, name: str) -> Pass:
         worse = f"explains the raw images worse by {100 * told['worse_share']:.1f} %"
         note = f"{name}: the second pass {worse}: kept out, poses and shape are those before it"
         return replace(refined, passes=(told,), notes=(*refined.notes, note))
-    return replace(ended, passes=(told,), notes=(*ended.notes, *_said(told), *departures(run.config.cycle)))
+    ended = replace(ended, passes=(told,), notes=(*ended.notes, *_said(told), *departures(run.config.cycle)))
+    return _until_converged(run, ended, name) if variant.refined == "converged" else ended
 
 
 def departures(config: CycleConfig) -> tuple[str, ...]:
@@ -121,22 +120,26 @@ def second_pass(run: Run, refined: Pass, masks: Mapping[int, Done], name: str, i
     return replace(refined, tracks=tracks, shapes=dict.fromkeys(tracks, field_of))
 
 
-def _until_converged(run: Run, start: Pass, name: str) -> Pass:
-    """Passes until poses and shape stay as they are, or get worse on the raw images: then the better ones are kept."""
-    config, best, passes = run.config.cycle, start, []
-    for k in range(config.most_passes):
-        after = second_pass(run, with_contact(run, best, name), start.masks, name, icp=True)
-        told = {"pass": k + 2, **_told(run, best, after, start.masks, name)}
+def _until_converged(run: Run, second: Pass, name: str) -> Pass:
+    """After the second pass further ones, for as long as they explain the raw images better and change poses or shape;
+    the best one is kept."""
+    best, passes = second, list(second.passes)
+    for number in range(3, 3 + run.config.cycle.most_passes):
+        after = second_pass(run, with_contact(run, best, name), best.masks, name, icp=True)
+        told = {"pass": number, **_told(run, best, after, best.masks, name)}
         passes.append(told)
-        if told["worse_share"] > config.worse_share:
-            note = f"pass {k + 2} explains the raw images worse by {100 * told['worse_share']:.1f} %: pass {k + 1} kept"
+        worse = 100 * told["worse_share"]
+        if worse > 0:
+            note = (
+                f"converged: pass {number} explains the raw images no better (worse by {worse:.2f} %) and is left out"
+            )
             return replace(best, passes=tuple(passes), notes=(*best.notes, note))
         best = after
         if told["same"]:
-            return replace(best, passes=tuple(passes), notes=(*best.notes, f"converged after pass {k + 2}"))
-    return replace(
-        best, passes=tuple(passes), notes=(*best.notes, f"not converged after {config.most_passes} passes of the cycle")
-    )
+            note = f"converged: pass {number} changed nothing more"
+            return replace(best, passes=tuple(passes), notes=(*best.notes, note))
+    note = f"not converged after {run.config.cycle.most_passes} passes more"
+    return replace(best, passes=tuple(passes), notes=(*best.notes, note))
 
 
 def _joint(run: Run, start: Pass, name: str) -> Pass:

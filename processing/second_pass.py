@@ -32,8 +32,8 @@ Start = Literal["anew", "poses", "shape"]
 
 @dataclass(frozen=True)
 class CycleConfig:
-    """The cycle's settings. A pass counts as worse than the one before when its residuals on the raw images are, on
-    average over depth, outline, colour and contact, larger by more than `worse_share`."""
+    """The cycle's settings. Passes are compared by the mean over depth, outline, colour and contact of how much larger
+    their residuals are, as a share."""
 
     icp: IcpConfig = field(default_factory=IcpConfig)
     redraw: RedrawConfig = field(default_factory=RedrawConfig)
@@ -41,14 +41,14 @@ class CycleConfig:
     renderer: RendererName = "raycast"
     start: Start = "shape"
     """`anew` (the paper): the second pass is given the first pose only. `poses`: the poses at which the shape was drawn
-    are refined, only lost frames are sought. `shape`: the same, and the shape's own surface and colours take part; where
-    no frame looks, it stays."""
+    are refined, only lost frames are sought. `shape`: the same, and the shape's own surface and colours take part;
+    where no frame looks, it stays."""
     apart_mask: float = 0.12
     """A toss whose outline the common shape misses by more (1 - IoU, median over frames) is not of that shape."""
     much_worse: float = 0.02
     """A second pass whose residuals on the raw images are larger by more than this is kept out, and said to be."""
-    worse_share: float = 0.005
-    most_passes: int = 4
+    most_passes: int = 3
+    """After the second one, where passes go on until they converge."""
     same_rotation_deg: float = 0.05
     same_translation_m: float = 0.0001
     same_shape_m: float = 0.0001

@@ -12,18 +12,24 @@ import pytest
 import trimesh
 
 from processing.cli import config_of, main
-from processing.cycle import placement
+from processing.config import Config
+from processing.cycle import Pass, placement
 from processing.field.learn import LearnConfig
 from processing.field.train import FieldConfig
 from processing.icp import IcpConfig, ShapeSurface, align_frame
 from processing.judge import JudgeConfig, ShapeDrawer, explain
+from processing.pipeline import start_run
 from processing.reproject import RaycastRenderer
 from processing.reprojected import RedrawConfig, SecondFrames, redraw
+from processing.variants import TRACKERS, find_variant
 from recordings.geometry import rotation_exp
+from recordings.progress import Silent
 from recordings.results import Results
+from recordings.session import Session
 from recordings.tracks import ObjectShape, ObjectTrack, RigCalibration
 
 BOX_M = (0.10, 0.08, 0.06)
+SAMPLE = Path(__file__).resolve().parents[2] / "recordings" / "samples" / "box_toss"
 
 
 def box_shape() -> ObjectShape:
@@ -218,6 +224,28 @@ def test_contact_without_the_cycle_leaves_the_poses_as_vision_had_them(
 
 
 @pytest.mark.slow
+def test_passes_go_on_while_the_raw_images_are_explained_better_and_the_best_is_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from processing import cycle
+
+    judged = iter([0.001, -0.02, -0.01, 0.0005])
+    monkeypatch.setattr(cycle, "_told", lambda *a, **k: {"of": "x", "worse_share": next(judged), "same": False})
+    monkeypatch.setattr(cycle, "with_contact", lambda run, best, name: best)
+    count = iter(range(2, 9))
+
+    def another(*_: Any, **__: Any) -> Pass:
+        return Pass({}, {}, {}, shared_frame=True, notes=(f"made by pass {next(count)}",))
+
+    monkeypatch.setattr(cycle, "second_pass", another)
+    session = Session.open(SAMPLE)
+    run = start_run(session, session.tosses, tmp_path, Config(), TRACKERS[0], lambda _: Silent())
+    ended = cycle.run_cycle(run, find_variant("converged"), Pass({}, {}, {}, shared_frame=True), "x")
+    assert ended.notes[0] == "made by pass 4"
+    assert "pass 5 explains the raw images no better" in ended.notes[-1]
+    assert [p["worse_share"] for p in ended.passes] == [0.001, -0.02, -0.01, 0.0005]
+
+
 def test_rows_share_their_stages(whole_table: Results) -> None:
     stages = [p.name.split("-")[0] for p in whole_table.path.iterdir() if (p / "stage.json").exists()]
     assert stages.count("segment") == 2
