@@ -81,7 +81,8 @@ def test_a_shape_stretched_along_one_axis_has_the_larger_loss_on_tosses_it_was_n
     learned = held_out_model(run, "test", true_tracks, dict.fromkeys(true_tracks, true_shape))
     assert learned is not None
     small, large = (
-        held_out_losses(run, "test", true_tracks, dict.fromkeys(true_tracks, s), learned) for s in (true_shape, stretched)
+        held_out_losses(run, "test", true_tracks, dict.fromkeys(true_tracks, s), learned)
+        for s in (true_shape, stretched)
     )
     assert list(small) == list(large) == list(true_tracks)[1::2]
     assert sum(large.values()) > 1.3 * sum(small.values())
