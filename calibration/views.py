@@ -45,7 +45,7 @@ class _Grey(Sequence):
         return len(self._frames)
 
     def __getitem__(self, position: Any) -> Any:
-        image = codec.decode_image(self._frames[position])
+        image = codec.decode_image(self._frames[int(position)])
         return cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) if image.ndim == 3 else image
 
     def __iter__(self) -> Iterator[Any]:

@@ -279,7 +279,7 @@ def motion_residual(
 def _covariances(H: Float[Array, "d d"], free: Int[Array, " f"], n: int) -> Float[Array, "n 6 6"]:
     """Each free view's own block of the inverse; zero for the fixed, NaN elsewhere is left to the caller."""
     out = np.zeros((n, 6, 6))
-    inverse = np.linalg.inv(H + 1e-9 * np.trace(H) / len(H) * np.eye(len(H)))
+    inverse = np.linalg.inv(H + 1e-9 * np.trace(H) / max(len(H), 1) * np.eye(len(H)))
     for a, i in enumerate(free):
         out[i] = inverse[6 * a : 6 * a + 6, 6 * a : 6 * a + 6]
     return out
