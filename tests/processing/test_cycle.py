@@ -223,7 +223,6 @@ def test_contact_without_the_cycle_leaves_the_poses_as_vision_had_them(
     assert tracks[0] == tracks[1]
 
 
-@pytest.mark.slow
 def test_passes_go_on_while_the_raw_images_are_explained_better_and_the_best_is_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -246,6 +245,7 @@ def test_passes_go_on_while_the_raw_images_are_explained_better_and_the_best_is_
     assert [p["worse_share"] for p in ended.passes] == [0.001, -0.02, -0.01, 0.0005]
 
 
+@pytest.mark.slow
 def test_rows_share_their_stages(whole_table: Results) -> None:
     stages = [p.name.split("-")[0] for p in whole_table.path.iterdir() if (p / "stage.json").exists()]
     assert stages.count("segment") == 2
