@@ -165,7 +165,7 @@ def _at_best_height(
 ) -> tuple[float, dict[int, TossLoss]]:
     """How far (m) the plane is raised where the mean loss is least, and the losses there."""
     from processing.contact.judge import contact_loss_of, mean_loss_j
-    from processing.contact.learn import Plane
+    from processing.contact.plane import Plane
 
     def losses(raised_m: float) -> dict[int, TossLoss]:
         plane = Plane(model.plane_normal_world, model.plane_offset_m + float(raised_m), "the contact model")

@@ -16,7 +16,7 @@ from processing.score import Value, chamfers, true_mesh
 from processing.stage import Counts
 from recordings.errors import BadInput
 from recordings.results import VariantRecord, read_masks, read_shape, write_shape
-from recordings.tracks import Status
+from recordings.tracks import ObjectTrack, Status
 
 if TYPE_CHECKING:
     from processing.pipeline import Run
@@ -41,10 +41,9 @@ def coverage_floor(run: Run, record: VariantRecord, truth: Truth) -> dict[str, V
 
 def _fused(run: Run, toss: int, masks: Path, truth: Truth) -> Path | None:
     """Stage `floor` of one toss; None where the truth has no poses of it."""
-    from processing.truth import nowhere_track
 
     frames = run.frames(toss)
-    track = nowhere_track(toss, run.camera.frame, frames.times_ns)
+    track = ObjectTrack.nowhere(toss, run.camera.frame, frames.times_ns)
     poses = truth.camera_from_object(track)
     if poses is None or not np.isfinite(poses).any():
         return None

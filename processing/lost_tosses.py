@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 
 from processing.cycle import Pass
 from processing.stage import Counts, Done
-from processing.truth import nowhere_track
 from recordings.errors import BadInput
 from recordings.results import write_track
+from recordings.tracks import ObjectTrack
 
 if TYPE_CHECKING:
     from processing.pipeline import Run
@@ -66,7 +66,7 @@ def _lost_stage(run: Run, toss: int, masks: Done) -> Done:
 
     def compute(folder: Path) -> Counts:
         times_ns = run.session.toss(toss).rgbd(run.camera.frame).times_ns
-        write_track(folder, nowhere_track(toss, run.camera.frame, times_ns))
+        write_track(folder, ObjectTrack.nowhere(toss, run.camera.frame, times_ns))
         return {"frames": len(times_ns), "interpolated": 0, "lost": len(times_ns)}
 
     return run.store.run(

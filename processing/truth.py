@@ -19,7 +19,7 @@ from processing.start_pose import StartPose
 from recordings.errors import BadInput, DamagedFile
 from recordings.geometry import Transform
 from recordings.session import Session, Toss
-from recordings.tracks import ObjectTrack, RigCalibration, Status
+from recordings.tracks import ObjectTrack, RigCalibration
 
 MEETS_S = 0.005
 """A truth pose belongs to a frame when it is this near in time."""
@@ -84,20 +84,13 @@ def start_poses(given: Path | None, session: Session, tosses: Sequence[int], cam
     found = {}
     for toss in tosses:
         times_ns = session.toss(toss).rgbd(camera).times_ns
-        poses = truth.camera_from_object(nowhere_track(toss, camera, times_ns))
+        poses = truth.camera_from_object(ObjectTrack.nowhere(toss, camera, times_ns))
         known = np.flatnonzero(np.isfinite(poses[:, 0, 0])) if poses is not None else np.zeros(0, dtype=np.int64)
         if poses is None or len(known) == 0:
             raise BadInput(f"--start truth: {truth.folder} has no true pose in toss {toss}")
         first = int(known[0])
         found[toss] = StartPose(first, Transform.from_matrix(camera, "object", poses[first]))
     return found
-
-
-def nowhere_track(toss: int, camera: str, times_ns: Int64[Array, " n"]) -> ObjectTrack:
-    """A track of these times without a pose."""
-    n = len(times_ns)
-    status: tuple[Status, ...] = tuple("lost" for _ in range(n))
-    return ObjectTrack(toss, camera, "object", times_ns, np.full((n, 4, 4), np.nan), status, np.full((n, 6, 6), np.nan))
 
 
 def open_truth(given: Path | None, session: Session, calibration: RigCalibration) -> Truth | None:

@@ -17,7 +17,7 @@ from processing.track.sequence import track_toss
 from recordings.results import read_masks, read_shape, read_track, write_shape, write_track
 from recordings.session_writer import file_sha256
 from recordings.track_notes import write_notes
-from recordings.tracks import ObjectTrack, Status
+from recordings.tracks import ObjectTrack
 
 if TYPE_CHECKING:
     from processing.pipeline import Run
@@ -121,7 +121,9 @@ def register_stage(run: Run, tracks: dict[int, Done], masks: dict[int, Done]) ->
             "ambiguous": [t for t, unsure in zip(run.tosses, together.ambiguous, strict=True) if unsure],
         }
         for track, joined in zip(together.tracks, together.joined, strict=True):
-            write_track(folder, replace(track if joined else lost_track(track), object_frame="object"))
+            # a pose in another object frame is no pose in this one
+            kept = track if joined else ObjectTrack.nowhere(track.toss, track.camera, track.time_ns)
+            write_track(folder, replace(kept, object_frame="object"))
         return {**counts, "fit": [round(float(f), 4) if np.isfinite(f) else None for f in together.fit]}
 
     return run.store.run("register", 2, run.matcher_settings(run.config.register), inputs, compute)
@@ -147,14 +149,6 @@ def field_stage(run: Run, name: str, tracks: dict[int, Done], masks: dict[int, D
         return {"views": used, "vertices": len(shape.vertices_m), "unobserved_share": round(unseen, 4)}
 
     return run.store.run("field", 2, config, inputs, compute)
-
-
-def lost_track(track: ObjectTrack) -> ObjectTrack:
-    """The same frames, all lost: a pose in another object frame is no pose in this one."""
-    n = len(track.status)
-    status: tuple[Status, ...] = tuple("lost" for _ in range(n))
-    nowhere = np.full((n, 4, 4), np.nan)
-    return replace(track, camera_from_object=nowhere, status=status, covariance=np.full((n, 6, 6), np.nan))
 
 
 def _count(track: ObjectTrack) -> Counts:

@@ -43,6 +43,14 @@ class ObjectTrack:
                 f"track of toss {self.toss}: status and poses disagree; a pose must be NaN exactly where it is lost"
             )
 
+    @staticmethod
+    def nowhere(toss: int, camera: str, time_ns: Int64[Array, " n"]) -> ObjectTrack:
+        """A track of these times without a pose: every frame is lost."""
+        n = len(time_ns)
+        status: tuple[Status, ...] = tuple("lost" for _ in range(n))
+        poses, covariance = np.full((n, 4, 4), np.nan), np.full((n, 6, 6), np.nan)
+        return ObjectTrack(toss, camera, "object", time_ns, poses, status, covariance)
+
     @property
     def lost(self) -> Bool[Array, " n"]:
         return np.array([s == "lost" for s in self.status], dtype=bool)

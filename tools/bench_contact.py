@@ -22,8 +22,9 @@ import torch
 from processing.contact.evaluate import evaluate
 from processing.contact.from_tracks import learn_from_series
 from processing.contact.inertia import Physics, known_physics, uniform_physics
-from processing.contact.learn import ContactLearning, Plane, learn_contact
+from processing.contact.learn import ContactLearning, learn_contact
 from processing.contact.motion import PoseSeries, rotation_matrices
+from processing.contact.plane import Plane
 from processing.contact.prior import prior_from_size
 from recordings.tracks import ObjectShape
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from processing.contact.motion import PoseSeries
     from processing.truth import Truth
     from recordings.session import Session
-    from recordings.tracks import ObjectShape
+    from recordings.tracks import ObjectShape, ObjectTrack
 
 STAGE, VERSION = "contact-only", 2
 CAMERA = "d455"
@@ -176,14 +176,13 @@ def _truth_poses(session: Session, tosses: Sequence[int], given: Path | None, vi
 
 def _true_series(truth: Truth, session: Session, toss: int) -> PoseSeries | None:
     from processing.contact.motion import PoseSeries
-    from processing.truth import nowhere_track
     from recordings.session import Toss
     from recordings.session_writer import toss_name
 
     own = truth.folder / f"{toss_name(toss)}.mcap"
     if CAMERA not in session.calibration.cameras:
         return PoseSeries.from_poses(toss, Toss(own).poses("/groundtruth/pose")) if own.exists() else None
-    empty = nowhere_track(toss, CAMERA, session.toss(toss).rgbd(CAMERA).times_ns)
+    empty = ObjectTrack.nowhere(toss, CAMERA, session.toss(toss).rgbd(CAMERA).times_ns)
     poses = truth.camera_from_object(empty)
     return None if poses is None else PoseSeries.from_camera(toss, empty.time_ns, poses, CAMERA, session.calibration)
 

@@ -19,8 +19,7 @@ from processing.contact.inertia import Physics
 from processing.contact.intervals import Interval, Spread, bootstrap, curvature, extents, plane_sensitivity
 from processing.contact.loss import REFERENCE_MASS_KG, Body, StepData, Weights, contact_loss
 from processing.contact.motion import PoseSeries, Steps
-from processing.contact.plane import Plane as Plane  # others know it from here
-from processing.contact.plane import calibrated_plane as calibrated_plane
+from processing.contact.plane import Plane
 from processing.contact.prepared import Prepared, prepare, starts, transitions
 from processing.contact.prior import Frame, Prior, learned_shape
 from processing.contact.unexplained import unexplained_rows

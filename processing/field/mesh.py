@@ -77,7 +77,7 @@ def _evaluate(field: ObjectField, grid: Grid) -> Float32[Array, "a b c"]:
 def _colors(field: ObjectField, vertices_m: Float[Array, "v 3"]) -> Array:
     with torch.no_grad():
         points = torch.tensor(vertices_m, dtype=torch.float32, device=field.low.device)
-        rgb = torch.cat([field(part)[1] for part in points.split(200_000)]).cpu().numpy()
+        rgb = torch.cat([field.color(part) for part in points.split(200_000)]).cpu().numpy()
     return (rgb.clip(0, 1) * 255).round().astype(np.uint8)
 
 

@@ -40,10 +40,6 @@ class ObjectField(nn.Module):
             nn.init.zeros_(last.weight)
             nn.init.zeros_(last.bias)
 
-    def forward(self, points_m: Tensor) -> tuple[Tensor, Tensor]:
-        """Signed distance (n,) in metres and colour (n, 3)."""
-        return self.sdf(points_m), self.color(points_m)
-
     def sdf(self, points_m: Tensor) -> Tensor:
         """Signed distance (n,) in metres."""
         unit = self._unit(points_m)

@@ -37,14 +37,10 @@ def true_tracks(run: Run) -> dict[int, Done]:
     found = {}
     for toss in run.tosses:
         times_ns = run.frames(toss).times_ns
-        n = len(times_ns)
-        nowhere: tuple[Status, ...] = tuple("lost" for _ in range(n))
-        empty = ObjectTrack(
-            toss, "d455", "object", times_ns, np.full((n, 4, 4), np.nan), nowhere, np.full((n, 6, 6), np.nan)
-        )
+        empty = ObjectTrack.nowhere(toss, "d455", times_ns)
         poses = truth.camera_from_object(empty)
         assert poses is not None
-        covariance = np.tile(np.diag([1e-5] * 3 + [1e-7] * 3), (n, 1, 1))
+        covariance = np.tile(np.diag([1e-5] * 3 + [1e-7] * 3), (len(times_ns), 1, 1))
         status: tuple[Status, ...] = tuple("tracked" if np.isfinite(p).all() else "lost" for p in poses)
         found[toss] = stored_track(run, replace(empty, camera_from_object=poses, status=status, covariance=covariance))
     return found

@@ -5,8 +5,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from processing.contact import data_checks as checks
-from processing.contact.learn import Plane, learn_contact
+from processing.contact.learn import learn_contact
 from processing.contact.motion import PoseSeries, differences
+from processing.contact.plane import Plane
 from processing.contact.prior import prior_from_size
 from recordings.errors import BadInput
 

@@ -13,9 +13,10 @@ from processing.contact.from_tracks import TracksConfig, learn_from_tracks
 from processing.contact.fuse import Field, FusionConfig, Readings, Sizes, Surface, likely_sizes
 from processing.contact.inertia import uniform_physics
 from processing.contact.judge import contact_loss_of, mean_loss_j, uniform_model
-from processing.contact.learn import ContactConfig, Plane, calibrated_plane
+from processing.contact.learn import ContactConfig
 from processing.contact.loss import Weights
 from processing.contact.motion import PoseSeries, rotation_matrices
+from processing.contact.plane import Plane, calibrated_plane
 from processing.contact.support import trimmed_hull, volume_m3
 from processing.metrics import rollout_errors
 from recordings.errors import BadInput

@@ -11,10 +11,11 @@ from processing.contact.fit import Fit, FitConfig, Model
 from processing.contact.geometry import Box, FreePoints, hull_mesh, hull_of, sphere
 from processing.contact.inertia import inertia_from, known_physics, physics_of_session, uniform_physics
 from processing.contact.intervals import Interval
-from processing.contact.learn import ContactConfig, Plane, learn_contact
+from processing.contact.learn import ContactConfig, learn_contact
 from processing.contact.loss import Weights
 from processing.contact.motion import PoseSeries, rotation_matrices
 from processing.contact.pieces import carried, convex_pieces
+from processing.contact.plane import Plane
 from processing.contact.prior import prior_from_shape, prior_from_size
 from processing.contact.weights import Candidate, choose
 from recordings.errors import BadInput
