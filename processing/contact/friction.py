@@ -1,50 +1,56 @@
-"""Friction by rollouts, where frames are far apart.
+"""Friction, restitution and size where frames are far apart: the most likely ones (likelihood.py).
 
 At 30 Hz a transition spans several contacts: the slip at its end says little about the slip within, the dissipation
 term then prefers too little friction (without any noise: .15 for .25), and pose noise too much. So there the loss
-gives the shape, and the friction is the one whose rollouts in fine steps leave points of the surface least far off.
-They are compared from the frame before the first impact to AFTER_S behind it: sooner there is no contact to tell,
-much later the tumbling is chaos, in which less friction looks better. On simulated boxes (friction .1 to .5, with and
-without rebound, 148 and 30 Hz, noise up to 3 mm) the estimate depends neither on rate nor on noise; it is .83 +- .13 of
-the true one (.94 without rebound), on real cubes .95 +- .05. An AFTER_S of .15 is nearer (.93 +- .10), but on real
-tosses, of which there are few, it scatters so much (.15 to .21 for .18) that rollouts of half a second suffer.
+gives the shape, and friction is the one under which each frame follows best from the frames before it, together with
+what would be taken for friction otherwise: the rebound, the size along the object's axes, how much of an impulse the
+laws leave unexplained, and the pose noise. No weight and no horizon is chosen.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray as Array
 from scipy.stats import t as student
 
-from processing.contact.loss import Body
+from processing.contact.likelihood import Course, RigidBody, Trial, log_likelihoods
 from processing.contact.motion import PoseSeries
-from processing.contact.rollout import Start, rollout_errors, simulate
+from processing.contact.segment import Noise
 from processing.contact.smooth import Smoothed
 
 SLOW_S = 0.01
 """Frames further apart than this are too far apart for the loss to tell friction."""
-STEP_S = 1 / 592
-"""Of the rollouts: in steps of 1/148 s friction comes out a tenth lower."""
-AFTER_S = 0.3
-LEAST_TOSSES = 3
-MOST_TOSSES = 40
-FRICTIONS = np.geomspace(0.02, 1.2, 27)
+LEAST_TOSSES, MOST_TOSSES = 3, 12
+LEAST_FRAMES = 4
+FRICTIONS, RESTITUTIONS = (0.05, 0.1, 0.17, 0.3, 0.5), (0.0, 0.2, 0.45)
+"""Where the search begins: the best pair of these."""
+UNEXPLAINED, MOST_UNEXPLAINED = 0.1, 1.0
+FIRST_STEPS = np.array([0.25, 0.1, 0.7, 0.25, 0.03, 0.03, 0.03])
+"""Of log friction, restitution, log unexplained, log noise, log stretch (3)."""
+NARROWER, ROUNDS = 0.6, 5
+STRETCH_SIGMA = 0.05
+"""How far the loss's size may be off at such rates (standard deviation, relative)."""
+PROFILE = np.linspace(-0.4, 0.4, 9)
+"""Log frictions about the best, for the interval."""
 REPEATS = 300
 MODEL_SHARE = 0.1
-"""Standard deviation, relative, that stays with any number of tosses: rollouts know no rebound."""
+"""Standard deviation, relative, that stays with any number of tosses: the spread of the estimate beyond its sampling
+over simulated bodies of other contact laws (tools/bench_contact.py variety)."""
 
 
 @dataclass(frozen=True, eq=False)
-class RolledFriction:
-    """The friction, half its 95 % interval, and the surface error (m) per friction of FRICTIONS and toss."""
+class LikelyFriction:
+    """The friction and half its 95 % interval; what was found with it; log likelihood per friction of PROFILE and
+    toss."""
 
     value: float
     half_width: float
-    error_m: Float[Array, "f n"]
+    trial: Trial
+    profile: Float[Array, "f n"]
 
 
 def frames_are_slow(tracks: Sequence[PoseSeries]) -> bool:
@@ -52,70 +58,88 @@ def frames_are_slow(tracks: Sequence[PoseSeries]) -> bool:
     return float(np.median([t.step_s for t in tracks])) > SLOW_S
 
 
-def friction_by_rollouts(
-    body: Body,
-    contacts: int,
-    tracks: Sequence[PoseSeries],
-    smoothed: Sequence[Smoothed],
-    start: Start,
-    begin: Sequence[int],
-    seed: int = 0,
-) -> RolledFriction | None:
-    """Friction of a body of known shape; `start` holds the states at the frames `begin`, for rollouts of STEP_S.
-
-    None where fewer than LEAST_TOSSES tosses hit the plane.
-    """
-    hit = [i for i, s in enumerate(smoothed) if s.phases.first_impact is not None][:MOST_TOSSES]
-    if len(hit) < LEAST_TOSSES:
+def likely_friction(
+    body: RigidBody, tracks: Sequence[PoseSeries], smoothed: Sequence[Smoothed], seed: int = 0
+) -> LikelyFriction | None:
+    """The most likely friction of a body whose shape is known but for its size. None where fewer than LEAST_TOSSES
+    tosses hit the plane."""
+    found = [course for t, s in zip(tracks, smoothed) if (course := _course(t, s)) is not None]
+    if len(found) < LEAST_TOSSES:
         return None
-    spans = [_span_s(smoothed[i], begin[i]) for i in hit]
-    errors = _errors_m(body, contacts, [tracks[i] for i in hit], start, hit, [begin[i] for i in hit], spans)
-    value = _least(errors.mean(1))
-    rng = np.random.default_rng(seed)
-    drawn = rng.multinomial(len(hit), np.full(len(hit), 1 / len(hit)), REPEATS)
-    spread = float(np.std([_least(errors @ counts) for counts in drawn], ddof=1))
-    sampling = float(student.ppf(0.975, len(hit) - 1)) * spread * (len(hit) / (len(hit) - 1)) ** 0.5
-    return RolledFriction(value, float(np.hypot(sampling, 1.96 * MODEL_SHARE * value)), errors)
+    courses = [found[i] for i in np.unique(np.linspace(0, len(found) - 1, MOST_TOSSES).round().astype(int))]
+    noise = Noise(*(float(np.median([getattr(s.noise, n) for s in smoothed])) for n in ("position_m", "rotation_rad")))
+
+    def likely(trials: Float[Array, "m 7"]) -> Float[Array, "m n"]:
+        return log_likelihoods(courses, body, [_trial(x) for x in trials], noise)
+
+    best = _search(likely)
+    moves = PROFILE[:, None] * np.eye(7)[0]
+    profile = likely(best + moves)
+    best[0] += PROFILE[0] + _peak(profile.sum(1)) * (PROFILE[1] - PROFILE[0])
+    value = float(np.exp(best[0]))
+    sampling = _sampling(profile, np.random.default_rng(seed)) * value
+    return LikelyFriction(value, float(np.hypot(sampling, 1.96 * MODEL_SHARE * value)), _trial(best), profile)
 
 
-def _span_s(smoothed: Smoothed, begin: int) -> tuple[float, float]:
-    """Since the start of the rollout: the frame before the first impact, and AFTER_S behind the impact."""
-    time_s, impact = smoothed.states.time_s, smoothed.phases.first_impact or 0
-    return float(time_s[max(impact - 1, 0)] - time_s[begin]), float(time_s[impact] - time_s[begin]) + AFTER_S
+def _course(track: PoseSeries, smoothed: Smoothed) -> Course | None:
+    """From the release to just behind the beginning of the rest, where it hits anything."""
+    phases = smoothed.phases
+    if phases.release is None or phases.first_impact is None:
+        return None
+    kept = slice(phases.release, len(track) if phases.rest is None else phases.rest + 2)
+    course = Course(track.time_s[kept], track.rotation[kept], track.position_m[kept])
+    return course if len(course.time_s) >= LEAST_FRAMES else None
 
 
-def _errors_m(
-    body: Body,
-    contacts: int,
-    tracks: Sequence[PoseSeries],
-    start: Start,
-    rows: Sequence[int],
-    begin: Sequence[int],
-    spans_s: Sequence[tuple[float, float]],
-) -> Float[Array, "f n"]:
-    """Mean over each toss's span of position error + mean half extent * rotation error, for every friction."""
-    count = len(FRICTIONS)
-    bodies = [replace(body, friction=body.friction.new_tensor(f)) for f in FRICTIONS]
-    every = Start(*(np.concatenate([values[list(rows)]] * count) for values in vars(start).values()))
-    owner = np.repeat(np.arange(count), len(rows)).tolist()
-    steps = int(np.ceil(max(end for _, end in spans_s) / STEP_S))
-    rolled = simulate(bodies, contacts, every, steps, STEP_S, owner)
-    errors = rollout_errors(rolled, list(tracks) * count, list(begin) * count, STEP_S)
-    reach_m = 0.5 * float((body.points_m.amax(0) - body.points_m.amin(0)).mean())
-    surface = (errors.position_m + reach_m * errors.rotation_rad).reshape(count, len(rows), steps)
-    found = []
-    for i, (first, last) in enumerate(spans_s):
-        part = surface[:, i, max(int(first / STEP_S), 0) : max(int(last / STEP_S), 1)]
-        found.append(np.nanmean(part, axis=1) if np.isfinite(part).any() else np.zeros(count))
-    return np.stack(found, 1)
+def _trial(x: Float[Array, "7"]) -> Trial:
+    a, b, c = np.exp(x[4:]).tolist()
+    return Trial(float(np.exp(x[0])), float(x[1]), float(np.exp(x[2])), float(np.exp(x[3])), (a, b, c))
 
 
-def _least(curve_m: Float[Array, " f"]) -> float:
-    """The friction of the least error: a parabola in log friction through the best of the grid and its neighbours."""
-    i = int(np.clip(curve_m.argmin(), 1, len(curve_m) - 2))
-    x, y = np.log(FRICTIONS[i - 1 : i + 2]), curve_m[i - 1 : i + 2]
-    bend = y[0] - 2 * y[1] + y[2]
-    if bend <= 0:
-        return float(FRICTIONS[curve_m.argmin()])
-    lowest = x[1] + 0.5 * (x[1] - x[0]) * (y[0] - y[2]) / bend
-    return float(np.exp(np.clip(lowest, x[0], x[2])))
+def _search(likely: Callable[[Float[Array, "m 7"]], Float[Array, "m n"]]) -> Float[Array, "7"]:
+    """The best of a grid, then rounds of a step to either side in every number and of the parabolas' tops, narrower
+    from round to round (contact makes the likelihood kinked: no gradient)."""
+
+    def value(points: Float[Array, "m 7"]) -> Float[Array, " m"]:
+        held = 0.5 * (points[:, 4:] ** 2).sum(1) / STRETCH_SIGMA**2
+        return likely(points).sum(1) - held
+
+    grid = np.array([[np.log(f), e, np.log(UNEXPLAINED), 0.0, 0.0, 0.0, 0.0] for f in FRICTIONS for e in RESTITUTIONS])
+    here = value(grid)
+    x, top, step = grid[here.argmax()], float(here.max()), FIRST_STEPS
+    for _ in range(ROUNDS):
+        sides = _inside(np.concatenate([x + np.diag(step), x - np.diag(step)]))
+        at = value(sides)
+        up, down = at[:7], at[7:]
+        bend = up + down - 2 * top
+        move = np.where(bend < 0, 0.5 * (up - down) / np.maximum(-bend, 1e-9), np.sign(up - down))
+        move = step * np.clip(move, -1, 1)
+        tops = _inside(np.array([x + move, x + 0.5 * move]))
+        every, values = np.concatenate([sides, tops]), np.concatenate([at, value(tops)])
+        if values.max() > top:
+            x, top = every[values.argmax()], float(values.max())
+        step = NARROWER * step
+    return x
+
+
+def _inside(points: Float[Array, "m 7"]) -> Float[Array, "m 7"]:
+    """Restitution at least 0; unexplained at most all."""
+    points[:, 1] = np.clip(points[:, 1], 0.0, 0.9)
+    points[:, 2] = np.clip(points[:, 2], -5.0, np.log(MOST_UNEXPLAINED))
+    return points
+
+
+def _peak(curve: Float[Array, " f"]) -> float:
+    """Where along its index a curve is highest: the top of the parabola through the best entry and its neighbours."""
+    i = int(np.clip(curve.argmax(), 1, len(curve) - 2))
+    before, here, after = curve[i - 1 : i + 2]
+    bend = before + after - 2 * here
+    return float(i + np.clip(0.5 * (before - after) / bend, -1, 1)) if bend < 0 else float(curve.argmax())
+
+
+def _sampling(profile: Float[Array, "f n"], rng: np.random.Generator) -> float:
+    """Half the 95 % interval of log friction, from drawing the tosses anew."""
+    n = profile.shape[1]
+    drawn = rng.multinomial(n, np.full(n, 1 / n), REPEATS)
+    spread = float(np.std([_peak(profile @ counts) for counts in drawn], ddof=1)) * float(PROFILE[1] - PROFILE[0])
+    return float(student.ppf(0.975, n - 1)) * spread * (n / (n - 1)) ** 0.5

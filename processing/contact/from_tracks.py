@@ -24,7 +24,7 @@ from processing.contact.learn import (
     ContactLearning,
     learn_contact,
     results_of,
-    rolled_friction,
+    slow_friction,
     with_friction,
 )
 from processing.contact.loss import REFERENCE_MASS_KG, contact_loss, find_contacts, point_velocity
@@ -243,8 +243,8 @@ def _fused(
     model = Model(FreePoints(points, geometry.pieces(), geometry.contacts), learning.fitted.inertia_start_kgm2, config)
     begin = np.concatenate([points.ravel() / SCALE_M, learning.fit.parameters[FRICTION:]])
     found = fit_lbfgs(model, begin, learning.data, learning.weights, 20)
-    rolled = rolled_friction(model, found.parameters, learning.prepared, contact_config)
-    found, spread = with_friction(found, learning.spread, rolled)
+    slow = slow_friction(model, found.parameters, learning.prepared, contact_config)
+    found, spread = with_friction(found, learning.spread, slow, model)
     moved = replace(prior, geometry=model.geometry)
     contact, _, friction, sizes = results_of(model, found.parameters, spread, moved, physics, plane, learning.touched)
     return replace(

@@ -12,11 +12,12 @@ from jaxtyping import Bool, Float
 from numpy import ndarray as Array
 
 from processing.contact import data_checks as checks
-from processing.contact.fit import FRICTION, Fit, FitConfig, Model, fit
-from processing.contact.friction import STEP_S, RolledFriction, frames_are_slow, friction_by_rollouts
+from processing.contact.fit import FRICTION, SHAPE, Fit, FitConfig, Model, fit
+from processing.contact.friction import LikelyFriction, frames_are_slow, likely_friction
 from processing.contact.geometry import GeometryName
 from processing.contact.inertia import Physics
 from processing.contact.intervals import Interval, Spread, bootstrap, curvature, extents, plane_sensitivity
+from processing.contact.likelihood import RigidBody
 from processing.contact.loss import REFERENCE_MASS_KG, Body, StepData, Weights, contact_loss
 from processing.contact.motion import PoseSeries, Steps
 from processing.contact.plane import Plane
@@ -43,8 +44,9 @@ class ContactConfig:
     is 1 to 3 % too large with 1; with 20 it is as much too small where poses are 3 mm off, which rollouts mind.)"""
     one_toss_dissipation: float = 30.0
     """Of a single toss, from which nothing can be held out."""
-    friction_by_rollouts: bool = True
-    """Where frames are far apart, the weights are chosen and there are tosses enough (friction.py)."""
+    likely_friction: bool = True
+    """Where frames are far apart, the weights are chosen and there are tosses enough: friction.py instead of the
+    loss's."""
     bootstrap_repeats: int = 16
     rollout_steps: int = 80
     rollout_step_s: float = 1 / 148
@@ -126,14 +128,14 @@ def learn_contact(
         data.weight[odd] = 0.0
         fits.append(fit(fitted, fits[0].parameters, data, weights))
     optimum = fits[-1].parameters
-    rolled = rolled_friction(fitted, optimum, prepared, config)
+    slow = slow_friction(fitted, optimum, prepared, config)
     cpu_seconds = time.process_time() - started
     progress.step(3, 6, "fitted")
     spread = _spread(fitted, optimum, data, weights, config, len(prepared.tracks))
     progress.step(4, 6, "intervals")
     sensitivity = plane_sensitivity(fitted, optimum, data, weights)
     progress.step(5, 6, "sensitivity")
-    last, spread = with_friction(fits[-1], spread, rolled)
+    last, spread = with_friction(fits[-1], spread, slow, fitted)
     optimum = last.parameters
     body = fitted.numbers(optimum)
     touched = touched_points(fitted, body, data, weights)
@@ -229,25 +231,31 @@ def _choose_weights(
     return sweep, Weights(dissipation=sweep.chosen.dissipation, penetration=config.penetration)
 
 
-def rolled_friction(
+def slow_friction(
     fitted: Model, optimum: Float[Array, " p"], prepared: Prepared, config: ContactConfig
-) -> RolledFriction | None:
-    """The friction by rollouts where it is better than the loss's; None where it is not, or not asked for."""
-    if config.weights is not None or not config.friction_by_rollouts or not frames_are_slow(prepared.tracks):
+) -> LikelyFriction | None:
+    """The most likely friction where it is better than the loss's; None where it is not, or not asked for."""
+    if config.weights is not None or not config.likely_friction or not frames_are_slow(prepared.tracks):
         return None
-    start, begin = starts(prepared, STEP_S, fitted.inertia_start_kgm2)
-    body, contacts = fitted.numbers(optimum), fitted.geometry.contacts
-    return friction_by_rollouts(body, contacts, prepared.tracks, prepared.smoothed, start, begin, config.seed)
+    body = fitted.numbers(optimum)
+    center, inertia = body.center_m.cpu().numpy(), body.inertia_kgm2.cpu().numpy()
+    points = body.points_m.cpu().numpy() - center
+    tracks = [t.about(center).turned(np.eye(3), float(body.plane_m)) for t in prepared.tracks]
+    rigid = RigidBody(points, fitted.geometry.contacts, inertia)
+    return likely_friction(rigid, tracks, prepared.smoothed, config.seed)
 
 
-def with_friction(done: Fit, spread: Spread, rolled: RolledFriction | None) -> tuple[Fit, Spread]:
-    """A fit and its intervals with the friction by rollouts, where there is one."""
-    if rolled is None:
+def with_friction(done: Fit, spread: Spread, slow: LikelyFriction | None, fitted: Model) -> tuple[Fit, Spread]:
+    """A fit and its intervals with the most likely friction, where there is one; and with the size that goes with it,
+    where size was learned and no prior holds the points."""
+    if slow is None:
         return done, spread
     parameters = done.parameters.copy()
-    parameters[FRICTION] = rolled.value**0.5
-    method = f"{spread.method}; friction by rollouts"
-    return replace(done, parameters=parameters), replace(spread, method=method, friction=rolled.half_width)
+    parameters[FRICTION] = slow.value**0.5
+    if fitted.config.learn_shape and fitted.sigma_m is None:
+        parameters[SHAPE] = (parameters[SHAPE].reshape(-1, 3) * slow.trial.stretch).ravel()
+    method = f"{spread.method}; friction by likelihood"
+    return replace(done, parameters=parameters), replace(spread, method=method, friction=slow.half_width)
 
 
 def _spread(
