@@ -27,7 +27,8 @@ def of_one_shape(
     run: Run, together: Done, shape: Done, masks: Mapping[int, Done], joined: Sequence[int]
 ) -> tuple[list[int], list[int]]:
     """Tosses that one shape explains, and those that it does not. The outline decides: the share of a toss's mask and
-    the drawn shape that is not common to both, against `CycleConfig.apart_mask`.
+    the drawn shape that is not common to both, against `CycleConfig.apart_mask`; and half of that must be more than
+    what the toss's own frames fused alone leave (a pixel of a small mask is much, a gripper hides some).
 
     Where the shape of all explains all, that is it. Else tosses are added one by one to the first, each kept only where
     the frames fused so far explain every toss among them.
@@ -44,13 +45,22 @@ def of_one_shape(
 
 
 def _unexplained(run: Run, together: Done, shape: Done, masks: Mapping[int, Done], tosses: Sequence[int]) -> list[int]:
-    """Tosses whose outline the shape does not explain."""
-    tracks, shapes = dict.fromkeys(tosses, together), dict.fromkeys(tosses, shape)
-    judged = judge_stage(run, "all tosses", tracks, shapes, {t: masks[t] for t in tosses})
+    """Tosses whose outline the shape does not explain, although their own frames alone do."""
+    limit = run.config.cycle.apart_mask
+    left = _left(run, together, dict.fromkeys(tosses, shape), masks)
+    odd = [t for t in tosses if left[t] > limit]
+    if not odd:
+        return []
+    alone = _left(run, together, {t: _fused_stage(run, together, {t: masks[t]}) for t in odd}, masks)
+    return [t for t in odd if left[t] > alone[t] + 0.5 * limit]
+
+
+def _left(run: Run, together: Done, shapes: Mapping[int, Done], masks: Mapping[int, Done]) -> dict[int, float]:
+    """Share of outline and drawn shape that is not common, median over a toss's frames; 0 where none can be judged."""
+    judged = judge_stage(run, "one shape", dict.fromkeys(shapes, together), shapes, {t: masks[t] for t in shapes})
     with np.load(judged.folder / "residuals.npz", allow_pickle=False) as stored:
         rows = stored["rows"]
-    limit = run.config.cycle.apart_mask
-    return [t for t in tosses if (rows[:, 0] == t).any() and float(np.median(rows[rows[:, 0] == t, 3])) > limit]
+    return {t: float(np.median(rows[rows[:, 0] == t, 3])) if (rows[:, 0] == t).any() else 0.0 for t in shapes}
 
 
 def _fused_stage(run: Run, together: Done, masks: Mapping[int, Done]) -> Done:
