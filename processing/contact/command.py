@@ -116,6 +116,8 @@ def chosen(given: str, there: Sequence[int], option: str) -> list[int]:
     first, dash, last = given.partition("-")
     if not first.isdigit() or (dash and not last.isdigit()):
         raise BadInput(f"{option} {given}: wanted a toss number or a range, for example {option} 0-15")
+    if dash and int(last) < int(first):
+        raise BadInput(f"{option} {given}: the range ends before it begins; wanted {option} {last}-{first}")
     found = [t for t in there if int(first) <= t <= int(last or first)]
     if not found:
         raise BadInput(f"{option} {given}: no such tosses; the session has {_span(there)}")
@@ -146,7 +148,8 @@ def find_poses(
             "wanted a tracked "
             "session: run `toss-process SESSION` first, or import poses with `toss-session import contactnets`"
         )
-    return PoseSource("/track/pose", [PoseSeries.from_poses(t, p) for t, p in found.items()], None)
+    name = "/track/pose" + ("" if poses is None else f" (there is no track of vision in {out_dir})")
+    return PoseSource(name, [PoseSeries.from_poses(t, p) for t, p in found.items()], None)
 
 
 class PoseSource:

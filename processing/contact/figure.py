@@ -84,11 +84,10 @@ def _errors(
         time_ms, unit * summary.curve_low, unit * summary.curve_high, color=BLUE, alpha=0.25, lw=0, zorder=2
     )
     axes.plot(time_ms, unit * summary.curve, color=BLUE, lw=2.2, zorder=3)
-    top = max(
-        float(np.nanpercentile(errors[:, -max(len(time_ms) // 4, 1) :], 97)),
-        float(np.nanmax(unit * summary.curve_high)),
-    )
-    axes.set(xlim=(0, time_ms[-1]), ylim=(0, 1.05 * top), xlabel="time since the start of the rollout, ms")
+    reached = int(np.flatnonzero(summary.count > 0)[-1]) + 1  # steps that some toss lasts for
+    late = errors[:, reached - max(reached // 4, 1) : reached]
+    top = max(float(np.nanpercentile(late, 97)), float(np.nanmax(unit * summary.curve_high)))
+    axes.set(xlim=(0, time_ms[reached - 1]), ylim=(0, 1.05 * top), xlabel="time since the start of the rollout, ms")
     what = ("position error, mm" if name == "mm" else "rotation error, deg") + (f" {against}" if against else "")
     axes.set_title(
         f"{what}: mean {unit * summary.mean:.1f} ({unit * summary.low:.1f} .. {unit * summary.high:.1f})",
@@ -100,7 +99,7 @@ def _errors(
         axes.text(0.02, 0.93, "red: not learned from", color=RED, fontsize=8, transform=axes.transAxes)
     missing = int((summary.count < summary.count[0]).sum())
     if missing:
-        ends = f"{int(summary.count[0])} tosses at first, {int(summary.count[-1])} at the end"
+        ends = f"{int(summary.count[0])} tosses at first, {int(summary.count[reached - 1])} at the end"
         axes.text(0.02, 0.87, ends, color=INK, fontsize=8, transform=axes.transAxes)
     _plain(axes)
 

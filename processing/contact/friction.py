@@ -31,7 +31,7 @@ FRICTIONS, RESTITUTIONS = (0.05, 0.1, 0.17, 0.3, 0.5), (0.0, 0.2, 0.45)
 UNEXPLAINED, MOST_UNEXPLAINED = 0.1, 1.0
 FIRST_STEPS = np.array([0.25, 0.1, 0.7, 0.25, 0.03, 0.03, 0.03])
 """Of log friction, restitution, log unexplained, log noise, log stretch (3)."""
-NARROWER, ROUNDS = 0.6, 5
+NARROWER, ROUNDS = 0.6, 4
 STRETCH_SIGMA = 0.05
 """How far the loss's size may be off at such rates (standard deviation, relative)."""
 PROFILE = np.linspace(-0.4, 0.4, 9)

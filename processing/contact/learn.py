@@ -21,11 +21,10 @@ from processing.contact.likelihood import RigidBody
 from processing.contact.loss import REFERENCE_MASS_KG, Body, StepData, Weights, contact_loss
 from processing.contact.motion import PoseSeries, Steps
 from processing.contact.plane import Plane
-from processing.contact.prepared import Prepared, prepare, starts, transitions
+from processing.contact.prepared import Prepared, no_contact, prepare, starts, transitions
 from processing.contact.prior import Frame, Prior, learned_shape
 from processing.contact.unexplained import unexplained_rows
 from processing.contact.weights import HeldOut, Sweep, SweepConfig, sweep_weights
-from recordings.errors import BadInput
 from recordings.progress import Progress, Silent
 from recordings.tracks import ContactModel, ObjectShape
 
@@ -204,11 +203,7 @@ def _require_contact(fitted: Model, steps: Steps, prepared: Prepared) -> None:
     """Raises BadInput where flight explains everything."""
     touching = [s for s in prepared.smoothed if not s.phases.in_flight.all()]
     if len(steps) == 0 or not touching:
-        raise BadInput(
-            f"no contact in the data: free flight explains all {len(steps)} transitions of {len(prepared.tracks)} "
-            "tosses; "
-            "wanted tosses that are recorded until the object has hit the plane"
-        )
+        raise no_contact(len(prepared.tracks), len(steps))
 
 
 def _choose_weights(

@@ -42,7 +42,7 @@ def prepare(tracks: Sequence[PoseSeries], frame: Frame, plane: Plane, inertia: F
         kept.append(moved)
         smoothed.append(smooth(moved, inertia))
     if not kept:
-        raise BadInput(_none_usable(left_out))
+        raise BadInput(none_usable(left_out))
     return Prepared(tuple(kept), tuple(smoothed), left_out)
 
 
@@ -84,7 +84,15 @@ def transitions(prepared: Prepared, smoothed: bool = True) -> Steps:
     return steps.only(steps.frame >= begin + 2)
 
 
-def _none_usable(left_out: Mapping[int, str]) -> str:
+def no_contact(tosses: int, transitions: int) -> BadInput:
+    """What to raise where flight explains everything."""
+    return BadInput(
+        f"no contact in the data: free flight explains all {transitions} transitions of {tosses} tosses; wanted tosses "
+        "that are recorded until the object has hit the plane: record longer, or choose others with --train I-J"
+    )
+
+
+def none_usable(left_out: Mapping[int, str]) -> str:
     """Why no toss can be used: the first reasons, how many more there are, and what to do."""
     if not left_out:
         return "no tosses were given; wanted at least one"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -79,12 +80,12 @@ def warnings_of(learning: ContactLearning) -> list[str]:
     return found
 
 
-def result_text(learning: ContactLearning, evaluation: Evaluation | None) -> str:
-    """A few lines for the terminal."""
+def result_text(learning: ContactLearning, evaluation: Evaluation | None, warnings: Sequence[str] = ()) -> str:
+    """A few lines for the terminal; `warnings` are those that the command adds."""
     f = learning.friction
     edges = " x ".join(f"{s.value * 1e3:.1f}" for s in learning.extents)
     half = ", ".join(f"{(s.high - s.low) / 2e-3:.1f}" for s in learning.extents)
-    lines = [f"warning: {w}" for w in warnings_of(learning)]
+    lines = [f"warning: {w}" for w in (*warnings_of(learning), *warnings)]
     lines += [
         f"learned from {len(learning.tosses)} tosses, {learning.transitions} transitions ({learning.geometry})",
         f"size      {edges} mm (95 %: +- {half})",

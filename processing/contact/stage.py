@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,8 +14,8 @@ import numpy as np
 import torch
 
 from processing.contact.choice import CLASSES, ClassName
-from processing.contact.command import STAGE, VERSION, PoseSource
-from processing.contact.data_checks import duplicate_groups, refuse_leaks
+from processing.contact.command import DEFAULT_STEPS, STAGE, VERSION, PoseSource
+from processing.contact.data_checks import check_frames, duplicate_groups, refuse_leaks
 from processing.contact.evaluate import Evaluation, evaluate, world_poses
 from processing.contact.export import write_assets
 from processing.contact.figure import draw_result
@@ -25,6 +25,7 @@ from processing.contact.inertia import Physics, physics_of_session, uniform_box_
 from processing.contact.learn import ContactConfig, ContactLearning, learn_contact
 from processing.contact.motion import PoseSeries
 from processing.contact.plane import Plane, calibrated_plane
+from processing.contact.prepared import no_contact, none_usable
 from processing.contact.prior import Prior, prior_from_shape, prior_from_size
 from processing.contact.result import result_document, result_text, warnings_of
 from processing.contact.segment import find_phases
@@ -71,12 +72,13 @@ def run_stage(
     plane = session_plane(session)
     given = physics_of_session(session.start)
     train = [tracks[t] for t in learned]
+    wanted, steps = steps, min(steps, max(DEFAULT_STEPS, _longest(tracks[t] for t in tested)))
     config = ContactConfig(fit=FitConfig(device=device, friction_start=0.03), rollout_steps=steps)
 
     def compute(folder: Path) -> Mapping[str, Any]:
         learning, shape, extra = _learn(train, geometry, init_m, source, given, plane, config, progress)
         evaluation = evaluate(learning, [tracks[t] for t in tested], plane, steps, STEP_S, "thrown")
-        document = result_document(learning, evaluation)
+        document, more = result_document(learning, evaluation), [*_unmeasured(geometry, source), *_cut(wanted, steps)]
         document |= {
             "session": session.name,
             "poses": source.name,
@@ -85,13 +87,13 @@ def run_stage(
             "not_learned_from": list(marked),
             "without_poses": missing,
             "plane": {"offset_m": plane.offset_m, "normal": plane.normal_world.tolist(), "source": plane.source},
-            "warnings": [*warnings_of(learning), *_unmeasured(geometry, source)],
+            "warnings": [*warnings_of(learning), *more],
             "seconds": time.perf_counter() - began,
             "cpu_seconds_total": time.process_time(),
             **extra,
         }
         _write(folder, session, learning, shape, evaluation, marked, document, plane)
-        return {"text": result_text(learning, evaluation)}
+        return {"text": result_text(learning, evaluation, more)}
 
     settings = {
         "train": list(learned),
@@ -193,6 +195,17 @@ def _digest(tracks: Mapping[int, PoseSeries], learned: Sequence[int], tested: Se
     return content.hexdigest()
 
 
+def _longest(tracks: Iterable[PoseSeries]) -> int:
+    """Steps of STEP_S that the longest toss lasts for."""
+    return max(int((t.time_s[-1] - t.time_s[0]) / STEP_S + 0.5) if len(t) else 0 for t in tracks)
+
+
+def _cut(wanted: int, steps: int) -> list[str]:
+    if wanted == steps:
+        return []
+    return [f"--steps {wanted}: no toss lasts that long; rolled out over {steps} steps, to the end of the longest one"]
+
+
 def _unmeasured(geometry: str | None, source: PoseSource) -> list[str]:
     if geometry != "nonconvex" or source.shape is not None:
         return []
@@ -285,12 +298,22 @@ def make_prior(
 
 def resting_side_m(tracks: Sequence[PoseSeries], plane: Plane) -> float:
     """Twice the height at which the object's origin rests. Raises BadInput where no toss comes to rest."""
-    heights = []
+    heights, transitions, touched, wrong = [], 0, False, dict[int, str]()
     for track in tracks:
+        try:
+            check_frames(track)
+        except BadInput as why:
+            wrong[track.toss] = str(why)
+            continue
         level = track.turned(plane.level_from_world(), plane.offset_m)
-        rest = find_phases(level, np.eye(3)).rest
-        if rest is not None:
-            heights.append(float(np.median(level.position_m[rest:, 2])))
+        phases = find_phases(level, np.eye(3))
+        transitions, touched = transitions + len(level) - 2, touched or not bool(phases.in_flight.all())
+        if phases.rest is not None:
+            heights.append(float(np.median(level.position_m[phases.rest :, 2])))
+    if len(wrong) == len(tracks):
+        raise BadInput(none_usable(wrong))
+    if not touched:
+        raise no_contact(len(tracks) - len(wrong), transitions)
     if not heights or np.median(heights) < 0.0025:
         raise BadInput("no toss comes to rest above the plane, so no size to start from; give one: --init SIDE_M")
     return 2 * float(np.median(heights))

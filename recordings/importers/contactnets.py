@@ -132,7 +132,9 @@ def _read(path: Path) -> Float[Array, "t c"]:
     table = table.astype(np.float64)
     if not np.isfinite(table).all():
         step = int(np.flatnonzero(~np.isfinite(table).all(axis=1))[0])
-        raise BadInput(f"{path}: step {step} holds NaN or infinity; wanted numbers")
+        raise BadInput(
+            f"{path}: step {step} holds NaN or infinity; wanted numbers: move the file away, and import again"
+        )
     return table
 
 

@@ -81,9 +81,12 @@ def test_the_imported_poses_are_the_track(poses_session, tmp_path):
     [
         ({"train": "0-2"}, "no such tosses"),
         ({"train": "x"}, "wanted a toss number or a range"),
+        ({"train": "9-3"}, "ends before it begins; wanted --train 3-9"),
         ({"test": "3-9"}, "wanted some left to learn from"),
         ({"steps": 0}, "at least 1"),
         ({"init_m": 50.0}, "metres"),
+        ({"init_m": 0.0}, "metres"),
+        ({"init_m": -0.05}, "metres"),
         ({"poses": "truth"}, "toss-truth"),
     ],
 )
@@ -113,6 +116,78 @@ def test_visions_shape_is_brought_into_the_frame_of_the_truth(simulated_tosses):
     np.testing.assert_allclose(moved.vertices_m, corners, atol=1e-9)
     with pytest.raises(BadInput, match="no frame has both"):
         in_frame_of(true, PoseSource("track", [], seen))
+
+
+def written(tmp_path, tracks, name="others"):
+    """A poses-only session of some tracks."""
+    with SessionWriter(
+        tmp_path / name, {"name": name, "object": {"name": "box"}}, RigCalibration(cameras={})
+    ) as writer:
+        for track in tracks:
+            with writer.toss(track.toss) as toss:
+                for i, (R, p) in enumerate(zip(track.rotation, track.position_m)):
+                    time_ns = 1_000_000_000 + round(1e9 * track.time_s[i])
+                    pose = Transform("world", "object", R, p)
+                    toss.pose("/track/pose", StampedPose(time_ns, "world", "object", pose.matrix))
+        writer.finish("complete")
+    return Session.open(tmp_path / name)
+
+
+@pytest.mark.parametrize("init_m", [None, 0.08])
+def test_tosses_without_contact_are_refused_whatever_the_start(simulated_tosses, tmp_path, init_m):
+    session = written(tmp_path, [t.part(slice(0, 10)) for t in simulated_tosses(4)])
+    with pytest.raises(BadInput, match="no contact in the data.*wanted tosses that are recorded until"):
+        contact_only(session, tmp_path / "out", init_m=init_m)
+
+
+@pytest.mark.parametrize("init_m", [None, 0.08])
+def test_tosses_that_are_all_too_short_are_refused_as_such(simulated_tosses, tmp_path, init_m):
+    session = written(tmp_path, [t.part(slice(0, 4)) for t in simulated_tosses(4)])
+    with pytest.raises(BadInput, match="no toss can be used: toss 0: 4 frames with a pose; wanted at least 5"):
+        contact_only(session, tmp_path / "out", init_m=init_m)
+
+
+@pytest.mark.parametrize("init_m", [None, 0.08])
+def test_a_wrong_step_is_refused_with_the_one_that_fits(simulated_tosses, tmp_path, init_m):
+    session = written(tmp_path, [replace(t, time_s=1.2 * t.time_s) for t in simulated_tosses(4)])
+    with pytest.raises(BadInput, match=r"free fall reads .* instead of 9.81: either the time step is wrong"):
+        contact_only(session, tmp_path / "out", init_m=init_m)
+
+
+def test_a_duplicate_across_training_and_test_is_refused(simulated_tosses, tmp_path):
+    tracks = simulated_tosses(3)
+    session = written(tmp_path, [*tracks, replace(tracks[1], toss=7)])
+    with pytest.raises(BadInput, match="toss 7 of --test is the same recording as toss 1 of --train"):
+        contact_only(session, tmp_path / "out", train="0-2", test="7")
+
+
+def test_more_steps_than_any_toss_has_end_with_the_longest_one_and_it_is_said(poses_session, tmp_path):
+    """And a track that was asked for where there is none is said to be the imported poses."""
+    document, text = contact_only(
+        poses_session, tmp_path / "out", train="3", test="8-9", init_m=0.08, steps=5000, poses="track"
+    )
+    assert document["rollout"]["steps"] == 129
+    assert "no toss lasts that long" in document["warnings"][-1]
+    assert "no toss lasts that long" in text
+    assert "there is no track of vision" in document["poses"]
+
+
+def test_errors_are_drawn_of_rollouts_that_go_on_after_every_toss(tmp_path):
+    from matplotlib.figure import Figure
+
+    from processing.contact.evaluate import Evaluation, summarise
+    from processing.contact.figure import draw_errors
+    from processing.contact.rollout import Rollout, RolloutErrors, Start
+
+    ended = np.where(np.arange(80) < 40, 0.01, np.nan) * np.ones((3, 1))
+    errors = RolloutErrors((0, 1, 2), 1 / 148, ended, ended, 0)
+    rolled = Rollout(np.zeros((3, 80, 3, 3)), np.zeros((3, 80, 3)), 0)
+    start = Start(np.zeros((3, 3, 3)), np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3)))
+    done = Evaluation(errors, summarise(ended), summarise(ended), {}, rolled, start, (0.0, 0.0, 0.0))
+    left, right = Figure().subplots(1, 2)
+    draw_errors(left, right, done, ())
+    assert left.get_xlim() == pytest.approx((0, 40 / 0.148))
+    assert left.get_ylim()[1] == pytest.approx(10.5)
 
 
 def test_ranges_take_the_tosses_that_exist():
