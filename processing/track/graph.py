@@ -184,7 +184,7 @@ def _add_motion(
     place: Int[Array, " n"], motion: Motion, config: GraphConfig,
 ) -> None:  # fmt: skip
     """Adds the pull towards constant spin and ballistic centre over each three views in a row; impacts are outliers
-    (Cauchy). The residuals are changes of spin (rad/s) and of velocity (m/s), camera axes."""
+    (`_believed`). The residuals are changes of spin (rad/s) and of velocity (m/s), camera axes."""
     index = np.flatnonzero(use)
     _add_still(H, g, poses, index, place, motion, config)
     if config.jerk_rad_s is not None:
@@ -194,8 +194,8 @@ def _add_motion(
             continue
         residual, jacobians = motion_residual((poses[a], poses[b], poses[c]), motion.times_s[[a, b, c]], motion)
         spin, speed = residual[:3] / config.spin_change_rad_s, residual[3:] / config.velocity_change_m_s
-        w_spin = 1.0 / (1.0 + spin @ spin / 4.0) / config.spin_change_rad_s**2
-        w_speed = 1.0 / (1.0 + speed @ speed / 4.0) / config.velocity_change_m_s**2
+        w_spin = _believed(spin) / config.spin_change_rad_s**2
+        w_speed = _believed(speed) / config.velocity_change_m_s**2
         w = np.array([w_spin] * 3 + [w_speed] * 3)
         for x, jx in zip((a, b, c), jacobians):
             if place[x] < 0:
@@ -210,14 +210,14 @@ def _add_smooth(
     H: Float[Array, "f f 6 6"], g: Float[Array, "f 6"], poses: Float[Array, "n 4 4"], index: Int[Array, " m"],
     place: Int[Array, " n"], motion: Motion, sigma_rad_s: float,
 ) -> None:  # fmt: skip
-    """Adds the pull towards a steady change of spin over each four views in a row (rad/s, camera axes; Cauchy)."""
+    """Adds the pull towards a steady change of spin over each four views in a row (rad/s, camera axes; `_believed`)."""
     for four in zip(index, index[1:], index[2:], index[3:]):
         if len({int(motion.toss[i]) for i in four}) > 1 or motion.still[list(four[1:])].any():
             continue
         steps = np.diff(motion.times_s[list(four)])
         spins = [turn_between(poses[b], poses[a]) / s for a, b, s in zip(four, four[1:], steps)]
         residual = spins[2] - 2 * spins[1] + spins[0]
-        w = 1.0 / (sigma_rad_s**2 + residual @ residual / 4.0)
+        w = _believed(residual / sigma_rad_s) / sigma_rad_s**2
         shares = (-1 / steps[0], 1 / steps[0] + 2 / steps[1], -2 / steps[1] - 1 / steps[2], 1 / steps[2])
         jacobians = [-share * poses[i][:3, :3] for i, share in zip(four, shares)]
         for x, jx in zip(four, jacobians):
@@ -227,6 +227,12 @@ def _add_smooth(
             for y, jy in zip(four, jacobians):
                 if place[y] >= 0:
                     H[place[x], place[y], 3:, 3:] += w * jx.T @ jy
+
+
+def _believed(normalised: Float[Array, " d"]) -> float:
+    """Weight of a change of motion in standard deviations (Geman-McClure): an impact must not pull at all. A kernel
+    whose pull fades slowly (Cauchy) turns small or blurred objects by tens of degrees where they hit the table."""
+    return float(1.0 / (1.0 + normalised @ normalised / 4.0) ** 2)
 
 
 def _add_still(

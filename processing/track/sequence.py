@@ -41,6 +41,8 @@ class TrackConfig:
     story: StoryConfig = field(default_factory=StoryConfig)
     flags: FlagConfig = field(default_factory=FlagConfig)
     shape: ShapeConfig = field(default_factory=ShapeConfig)
+    unheard_deg: float = 20.0
+    """What is told forward is a story of its own where those told backward differ from it by more."""
     least_confidence: float = 0.2
     """Frames whose mask is less sure are not looked at."""
 
@@ -230,8 +232,9 @@ def _middle(store: ViewStore, view: int, known: _Known) -> Float[Array, "3"]:
 def _followed(
     scene: Scene, first: int, known: _Known, config: TrackConfig, progress: Progress
 ) -> tuple[list[Hypothesis], float, dict[int, list[Candidate]]]:
-    """Two stories of the same frames: the beam forward, then once more backward with all that forward learned as the
-    model; and a beam backward that knows nothing of the first but where the last frame is."""
+    """Stories of the same frames: the beam forward, then once more backward with all that forward learned as the
+    model; a beam backward that knows nothing of the first but where the last frame is; and the beam forward itself,
+    where both backward say something else."""
     n = len(scene.times_s)
 
     def told(i: int, beam: list[Hypothesis]) -> None:
@@ -248,6 +251,8 @@ def _followed(
     if known.model is None and last > first + 1:
         fresh = started(scene.store, n, last, best.poses[last])
         stories.append(_anchored(follow(scene, np.arange(last - 1, first - 1, -1), [fresh], narrow).best, best, first))
+        if all(apart_deg(best.poses[:n], s.poses[:n]) > config.unheard_deg for s in stories):
+            stories.append(best)
     out = []
     for story in stories:
         if any(scene.store.usable(i) for i in range(first)):

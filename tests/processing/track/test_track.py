@@ -14,7 +14,7 @@ from processing.metrics import align_first, frame_errors
 from processing.track import kernels as k
 from processing.track.features import rigid_fit
 from processing.track.flags import camera_covariance
-from processing.track.graph import flight_center
+from processing.track.graph import GraphConfig, Motion, _add_motion, flight_center
 from processing.track.keyframes import KeyframeConfig, references
 from processing.track.motion import MotionConfig, all_turns, change_cost, moved, steady_spin, turn_between
 from processing.track.register import register_tosses
@@ -43,6 +43,27 @@ def flight(count: int, center: np.ndarray, spin: np.ndarray, step_s: float = 1 /
         middle = np.array([0.1, 0.0, 1.0]) + np.array([0.4, 0.2, 1.5]) * t + 0.5 * np.array([0, 0, -9.81]) * t * t
         poses[i, :3, 3] = middle - poses[i, :3, :3] @ center
     return poses, times
+
+
+def pull_on_turns(poses: np.ndarray, times: np.ndarray) -> float:
+    """Largest pull (per rad) of steady motion on the turn of any pose."""
+    n = len(poses)
+    motion = Motion(times, np.zeros(n, dtype=np.int64), np.array([0, 0, -9.81]), np.zeros(3), np.zeros(n, dtype=bool))
+    H, g = np.zeros((n, n, 6, 6)), np.zeros((n, 6))
+    _add_motion(H, g, poses, np.ones(n, dtype=bool), np.arange(n), motion, GraphConfig())
+    return float(np.linalg.norm(g[:, 3:], axis=1).max())
+
+
+@pytest.mark.parametrize("impact_rad_s", [20.0, 35.0])
+def test_an_impact_does_not_pull_at_the_turns_around_it_but_a_small_error_does(impact_rad_s: float) -> None:
+    poses, times = flight(8, np.zeros(3), np.array([1.0, 2.0, -1.0]))
+    assert pull_on_turns(poses, times) < 1e-6
+    for i in range(4, 8):  # another spin from frame 4 on
+        poses[i, :3, :3] = rotation_exp(np.array([impact_rad_s, 0, 0]) * (times[i] - times[3])) @ poses[3, :3, :3]
+    struck = pull_on_turns(poses, times)
+    steady, _ = flight(8, np.zeros(3), np.array([1.0, 2.0, -1.0]))
+    steady[4, :3, :3] = rotation_exp(np.array([np.radians(0.5), 0, 0])) @ steady[4, :3, :3]
+    assert struck < 0.002 * pull_on_turns(steady, times)
 
 
 @given(SMALL)
