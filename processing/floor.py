@@ -15,7 +15,7 @@ from processing.field.mesh import grid_mesh
 from processing.score import Value, chamfers, true_mesh
 from processing.stage import Counts
 from recordings.errors import BadInput
-from recordings.results import VariantRecord, read_masks, read_shape, write_shape
+from recordings.results import RobotMasks, VariantRecord, read_masks, read_shape, write_shape
 from recordings.tracks import ObjectTrack, Status
 
 if TYPE_CHECKING:
@@ -53,12 +53,13 @@ def _fused(run: Run, toss: int, masks: Path, truth: Truth) -> Path | None:
               "truth": hashlib.sha256(np.nan_to_num(poses).tobytes()).hexdigest()}  # fmt: skip
 
     def compute(folder: Path) -> Counts:
-        seen = TossViews(frames, frames.depth_times_ns, read_masks(masks, toss), known)
+        robot = RobotMasks.of(masks, toss)
+        seen = TossViews(frames, frames.depth_times_ns, read_masks(masks, toss), known, robot=robot)
         views = chosen_views([seen], run.camera, run.config.shape)
         write_shape(folder, grid_mesh(fuse(views, run.config.shape.field.fuse)))
         return {"views": len(views), "from": "true poses: for the scores only"}
 
     try:
-        return run.store.run("floor", 1, run.config.shape.field.fuse, inputs, compute).folder
+        return run.store.run("floor", 2, run.config.shape.field.fuse, inputs, compute).folder
     except BadInput:
         return None

@@ -17,7 +17,7 @@ from processing.field.fuse import fuse
 from processing.field.learn import TossViews, chosen_views
 from processing.field.mesh import grid_mesh
 from processing.stage import Counts, Done
-from recordings.results import read_masks, read_track, write_shape
+from recordings.results import RobotMasks, read_masks, read_track, write_shape
 
 if TYPE_CHECKING:
     from processing.pipeline import Run
@@ -72,9 +72,10 @@ def _fused_stage(run: Run, together: Done, masks: Mapping[int, Done]) -> Done:
         for toss, done in masks.items():
             frames = run.frames(toss)
             track = read_track(together.folder, toss)
-            seen.append(TossViews(frames, frames.depth_times_ns, read_masks(done.folder, toss), track))
+            robot = RobotMasks.of(done.folder, toss)
+            seen.append(TossViews(frames, frames.depth_times_ns, read_masks(done.folder, toss), track, robot=robot))
         views = chosen_views(seen, run.camera, run.config.shape)
         write_shape(folder, grid_mesh(fuse(views, run.config.shape.field.fuse), seen[0].track.object_frame))
         return {"tosses": list(masks), "views": len(views)}
 
-    return run.store.run("fused", 1, run.config.shape.field.fuse, inputs, compute)
+    return run.store.run("fused", 2, run.config.shape.field.fuse, inputs, compute)

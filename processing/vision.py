@@ -14,7 +14,7 @@ from processing.track.multi_hypothesis import read_toss_track, write_toss_track
 from processing.track.notes import notes_of
 from processing.track.register import register_tosses
 from processing.track.sequence import track_toss
-from recordings.results import read_masks, read_shape, read_track, write_shape, write_track
+from recordings.results import RobotMasks, read_masks, read_shape, read_track, write_shape, write_track
 from recordings.session_writer import file_sha256
 from recordings.track_notes import write_notes
 from recordings.tracks import ObjectTrack
@@ -140,15 +140,16 @@ def field_stage(run: Run, name: str, tracks: dict[int, Done], masks: dict[int, D
         views = []
         for toss, track in tracks.items():
             frames = run.frames(toss)
-            seen = read_masks(masks[toss].folder, toss)
-            views.append(TossViews(frames, frames.depth_times_ns, seen, read_track(track.folder, toss)))
+            seen, robot = read_masks(masks[toss].folder, toss), RobotMasks.of(masks[toss].folder, toss)
+            own = read_track(track.folder, toss)
+            views.append(TossViews(frames, frames.depth_times_ns, seen, own, robot=robot))
         camera = run.camera
         shape, used = learn_shape(views, camera, config, run.device, run.progress(f"{name}: shape"))
         write_shape(folder, shape)
         unseen = 0.0 if shape.observed is None else float((~shape.observed).mean())
         return {"views": used, "vertices": len(shape.vertices_m), "unobserved_share": round(unseen, 4)}
 
-    return run.store.run("field", 2, config, inputs, compute)
+    return run.store.run("field", 4, config, inputs, compute)
 
 
 def _count(track: ObjectTrack) -> Counts:

@@ -139,6 +139,24 @@ def read_masks(folder: Path, toss: int) -> Masks:
     return Masks(paths, np.array(document.get("confidence", [np.nan] * len(paths)), dtype=np.float64))
 
 
+@dataclass(frozen=True)
+class RobotMasks:
+    """Where the robot is seen in the colour frames of one toss, read when asked for."""
+
+    folder: Path
+
+    @staticmethod
+    def of(folder: Path, toss: int) -> RobotMasks | None:
+        """Those beside a stage's masks; None where no robot was drawn."""
+        path = folder / f"{_stem(toss)}.robot"
+        return RobotMasks(path) if path.is_dir() else None
+
+    def at(self, position: int, shape: tuple[int, int]) -> Bool[Array, "h w"]:
+        """The robot's pixels in one frame; all of them where it was not drawn there, because it may be anywhere."""
+        path = self.folder / f"{position:06d}.png"
+        return decode_mask(path.read_bytes(), path.name) if path.exists() else np.ones(shape, dtype=bool)
+
+
 def write_contact(folder: Path, model: ContactModel) -> Path:
     """Write `contact.json` into a stage's folder."""
     path = folder / "contact.json"

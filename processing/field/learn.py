@@ -17,6 +17,7 @@ from recordings.errors import BadInput
 from recordings.geometry import CameraModel
 from recordings.progress import Progress
 from recordings.records import RgbdFrame
+from recordings.results import RobotMasks
 from recordings.tracks import ObjectShape, ObjectTrack
 
 
@@ -30,13 +31,14 @@ class LearnConfig:
 @dataclass(frozen=True, eq=False)
 class TossViews:
     """One toss as the field sees it: frames are read when they are chosen. `colorless`: pixels of each mask whose
-    colour is not the object's."""
+    colour is not the object's. `robot`: what may stand before the object; rays that end there tell nothing of it."""
 
     frames: Sequence[RgbdFrame]
     depth_times_ns: Int64[Array, " n"]
     masks: Sequence[Bool[Array, "h w"]]
     track: ObjectTrack
     colorless: Sequence[Bool[Array, "h w"]] | None = None
+    robot: RobotMasks | None = None
 
 
 def learn_shape(
@@ -74,7 +76,9 @@ def _view(toss: TossViews, position: int, camera: CameraModel) -> FieldView | No
     pose = toss.track.camera_from_object[position]
     at_depth = pose_at(toss.track, position, int(toss.depth_times_ns[position]))
     foreign = None if toss.colorless is None else toss.colorless[position]
-    return make_view(toss.frames[position], toss.masks[position], camera, pose, at_depth, colorless=foreign)
+    mask = toss.masks[position]
+    robot = None if toss.robot is None else toss.robot.at(position, mask.shape)
+    return make_view(toss.frames[position], mask, camera, pose, at_depth, robot, foreign)
 
 
 FREE_M_S2 = 15.0
