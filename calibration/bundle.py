@@ -1,7 +1,9 @@
 """Bundle adjustment of cameras that look at known points: poses of cameras, views and tags, lenses where asked for.
 
-A point p of piece g, seen by camera c in view v, lies in that camera at X = C_c V_v G_g (s_g p), with the scale s,
-C = camera_from_rig, V = rig_from_body, G = body_from_piece. Each is free or fixed, and so is each camera's lens.
+A point p of piece g, seen by camera c in view v, lies in that camera at X = C_c V_v G_g (s_g p + d_m), with the scale
+s, C = camera_from_rig, V = rig_from_body, G = body_from_piece, and d the shift of the printed mark m that p belongs to.
+Each is free or fixed, and so is each camera's lens. Two more are known beforehand to be small: the marks' shifts d (no
+printer puts marks quite where they should be) and a slip of each image as a whole, which makes its points err alike.
 Residuals are whitened by the pixels' covariances; Huber's weight tames outliers. Levenberg-Marquardt on the normal
 equations, which are small here (some hundred unknowns). Free poses move by left increments exp([w, t]^) P, so a pose's
 covariance is that of (rotation vector, translation) in the frame it maps to.
@@ -9,8 +11,8 @@ covariance is that of (rotation vector, translation) in the frame it maps to.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -18,6 +20,7 @@ from numpy import ndarray as Array
 from scipy import sparse
 
 from calibration.poses import exp_poses
+from calibration.projected import by_lens, by_motion, by_point, lens_numbers, projected, with_lens
 from recordings.geometry import CameraModel
 
 POSE = 6
@@ -39,6 +42,10 @@ class Observations:
     points_m: Float[Array, "n 3"]
     pixels: Float[Array, "n 2"]
     whitening: Float[Array, "n 2 2"]
+    mark: Int[Array, " n"] | None = None
+    """Which printed mark a point belongs to; -1: one that lies where it is said to."""
+    image: Int[Array, " n"] | None = None
+    """Which image a point is in, for what shifts an image as a whole."""
 
     def __len__(self) -> int:
         return len(self.camera)
@@ -51,6 +58,8 @@ class Observations:
             self.points_m[keep],
             self.pixels[keep],
             self.whitening[keep],
+            None if self.mark is None else self.mark[keep],
+            None if self.image is None else self.image[keep],
         )
 
 
@@ -69,11 +78,20 @@ class Scene:
     scale: Float[Array, " g"]
     """True size of a piece / given size; `free_scales` let it be found."""
     free_scales: Bool[Array, " g"]
+    shift_m: Float[Array, "m 3"] = field(default_factory=lambda: np.zeros((0, 3)))
+    """Of printed marks from where they should be, on their piece."""
+    print_m: float | None = None
+    """Standard deviation of such a shift by axis; None: the shifts stay as they are."""
+    slip_px: Float[Array, "i 2"] = field(default_factory=lambda: np.zeros((0, 2)))
+    """By how much an image is shifted as a whole."""
+    steady_px: float | None = None
+    """Standard deviation of such a slip by axis; None: they stay as they are."""
 
 
 @dataclass(frozen=True, eq=False)
 class Solved:
-    """`residual_px` (n, 2) seen minus predicted; `covariance` of all free numbers, scaled by what is left over.
+    """`residual_px` (n, 2) seen minus predicted (what an image slips is left in); `covariance` of all free numbers,
+    scaled by what is left over.
 
     `blocks[("camera", 1)]` is the slice of camera 1's six numbers in it; ("lens", 1) fx fy cx cy and the distortion.
     """
@@ -108,12 +126,12 @@ def adjust(scene: Scene, seen: Observations, huber: float | None = 3.0) -> Solve
     blocks, size = _blocks(scene)
     damping = 1e-3
     residual, weight, jacobian = _linearised(scene, seen, blocks, size, huber)
-    cost = _cost(residual, huber)
+    cost = _cost(residual, huber) + _prior_cost(scene)
     for _ in range(STEPS):
-        normal, gradient = _normal(jacobian, residual, weight)
+        normal, gradient = _normal(jacobian, residual, weight, scene, blocks)
         step = _solve(normal, gradient, damping)
         trial = _moved(scene, blocks, step)
-        new_cost = _cost(_whitened(trial, seen)[0], huber)
+        new_cost = _cost(_whitened(trial, seen)[0], huber) + _prior_cost(trial)
         if not new_cost < cost:
             damping *= 8.0
             if damping > 1e8:
@@ -135,18 +153,19 @@ def _finished(
     weight: Float[Array, " n"],
     jacobian: sparse.csr_matrix,
 ) -> Solved:
-    normal, _ = _normal(jacobian, residual, weight)
+    normal, _ = _normal(jacobian, residual, weight, scene, blocks)
     scaling = 1.0 / np.sqrt(np.maximum(np.diag(normal), 1e-12))
     scaled = normal * np.outer(scaling, scaling) if len(normal) else np.ones((1, 1))
     values, vectors = np.linalg.eigh(scaled)
-    spare = max(1.0, 2.0 * float(weight.sum()) - len(normal))
-    scale = float(np.sqrt((weight * (residual**2).sum(axis=1)).sum() / spare))
+    known = sum(values.size for _, values, _ in _known_beforehand(scene))
+    spare = max(1.0, 2.0 * float(weight.sum()) + known - len(normal))
+    scale = float(np.sqrt(((weight * (residual**2).sum(axis=1)).sum() + _prior_cost(scene)) / spare))
     inverse = np.linalg.pinv(normal, hermitian=True, rcond=1e-13)
     worst = int(np.abs(vectors[:, 0]).argmax()) if len(normal) else -1
     named = next((name for name, where in blocks.items() if where.start <= worst < where.stop), ("none", -1))
     return Solved(
         scene,
-        -_unwhitened(residual, seen),
+        _slips(scene, seen) - _unwhitened(residual, seen),
         weight,
         inverse * max(scale, 1.0) ** 2,
         blocks,
@@ -174,43 +193,44 @@ def _blocks(scene: Scene) -> tuple[dict[tuple[str, int], slice], int]:
     for number in np.flatnonzero(scene.free_scales).tolist():
         blocks["scale", number] = slice(at, at + 1)
         at += 1
+    for kind, values, _ in _known_beforehand(scene):
+        for number in range(len(values)):
+            blocks[kind, number] = slice(at, at + values.shape[1])
+            at += values.shape[1]
     return blocks, at
 
 
-def lens_numbers(model: CameraModel) -> Float[Array, " k"]:
-    """fx fy cx cy and the distortion."""
-    return np.array([model.fx, model.fy, model.cx, model.cy, *model.distortion])
-
-
-def with_lens(model: CameraModel, numbers: Float[Array, " k"]) -> CameraModel:
-    K = np.array([[numbers[0], model.K[0, 1], numbers[2]], [0.0, numbers[1], numbers[3]], [0.0, 0.0, 1.0]])
-    return replace(model, K=K, distortion=tuple(numbers[4:].tolist()))
+def _known_beforehand(scene: Scene) -> list[tuple[str, Float[Array, "m k"], float]]:
+    """The free numbers that are 0 give or take a standard deviation."""
+    both = (("mark", scene.shift_m, scene.print_m), ("image", scene.slip_px, scene.steady_px))
+    return [(kind, values, std) for kind, values, std in both if std is not None and len(values)]
 
 
 def _chained(scene: Scene, seen: Observations) -> tuple[Array, Array, Array]:
     """The points in their body, in the rig and in their camera."""
     g, v, c = scene.body_from_piece[seen.piece], scene.rig_from_body[seen.view], scene.camera_from_rig[seen.camera]
-    in_body = np.einsum("nij,nj->ni", g[:, :3, :3], scene.scale[seen.piece, None] * seen.points_m) + g[:, :3, 3]
+    on_piece = scene.scale[seen.piece, None] * seen.points_m
+    if seen.mark is not None and len(scene.shift_m):
+        on_piece = on_piece + np.where(seen.mark[:, None] >= 0, scene.shift_m[seen.mark], 0.0)
+    in_body = np.einsum("nij,nj->ni", g[:, :3, :3], on_piece) + g[:, :3, 3]
     in_rig = np.einsum("nij,nj->ni", v[:, :3, :3], in_body) + v[:, :3, 3]
     return in_body, in_rig, np.einsum("nij,nj->ni", c[:, :3, :3], in_rig) + c[:, :3, 3]
-
-
-def _projected(
-    models: Sequence[CameraModel], camera: Int[Array, " n"], points_m: Float[Array, "n 3"]
-) -> Float[Array, "n 2"]:
-    out = np.empty((len(points_m), 2))
-    for number, model in enumerate(models):
-        mine = camera == number
-        out[mine] = model.project(points_m[mine])
-    return out
 
 
 def _whitened(scene: Scene, seen: Observations) -> tuple[Float[Array, "n 2"], Float[Array, "n 3"]]:
     """Whitened predicted minus seen, and the points in their cameras."""
     in_camera = _chained(scene, seen)[2]
-    gap = _projected(scene.models, seen.camera, in_camera) - seen.pixels
+    gap = projected(scene.models, seen.camera, in_camera) - seen.pixels
+    gap = gap + _slips(scene, seen)
     gap = np.where(np.isfinite(gap), gap, BEHIND_PX)
     return np.einsum("nij,nj->ni", seen.whitening, gap), in_camera
+
+
+def _slips(scene: Scene, seen: Observations) -> Float[Array, "n 2"]:
+    """Of the image that each point is in."""
+    if seen.image is None or not len(scene.slip_px):
+        return np.zeros((len(seen), 2))
+    return scene.slip_px[seen.image]
 
 
 def _cost(residual: Float[Array, "n 2"], huber: float | None) -> float:
@@ -227,8 +247,11 @@ def _linearised(
     length = np.maximum(np.linalg.norm(residual, axis=1), 1e-12)
     weight = np.ones(len(length)) if huber is None else np.minimum(1.0, huber / length)
     rows, columns, values = [], [], []
+    owners = {"view": seen.view, "piece": seen.piece, "scale": seen.piece, "mark": seen.mark, "image": seen.image}
     for kind, part in _derivatives(scene, seen, in_camera).items():
-        owner = {"view": seen.view, "piece": seen.piece, "scale": seen.piece}.get(kind, seen.camera)
+        owner = owners.get(kind, seen.camera)
+        if owner is None:
+            continue
         for number in np.unique(owner).tolist():
             where = blocks.get((kind, number))
             if where is None:
@@ -249,67 +272,45 @@ def _linearised(
 def _derivatives(scene: Scene, seen: Observations, in_camera: Float[Array, "n 3"]) -> dict[str, Array]:
     """Of the whitened residual by each kind of unknown: (n, 2, 6) for poses, (n, 2, k) for lenses."""
     in_body, in_rig, _ = _chained(scene, seen)
-    by_point = seen.whitening @ _by_point(scene.models, seen.camera, in_camera)
+    moved = seen.whitening @ by_point(scene.models, seen.camera, in_camera)
     R_c, R_v = scene.camera_from_rig[seen.camera, :3, :3], scene.rig_from_body[seen.view, :3, :3]
     found = {
-        "camera": by_point @ _by_motion(in_camera),
-        "view": by_point @ R_c @ _by_motion(in_rig),
-        "piece": by_point @ R_c @ R_v @ _by_motion(in_body),
+        "camera": moved @ by_motion(in_camera),
+        "view": moved @ R_c @ by_motion(in_rig),
+        "piece": moved @ R_c @ R_v @ by_motion(in_body),
     }
     if scene.free_scales.any():
         along = np.einsum("nij,nj->ni", scene.body_from_piece[seen.piece, :3, :3], seen.points_m)
-        found["scale"] = by_point @ R_c @ R_v @ along[:, :, None]
+        found["scale"] = moved @ R_c @ R_v @ along[:, :, None]
+    if scene.print_m is not None and seen.mark is not None:
+        found["mark"] = moved @ R_c @ R_v @ scene.body_from_piece[seen.piece, :3, :3]
+    if scene.steady_px is not None and seen.image is not None:
+        found["image"] = seen.whitening
     if scene.free_lenses.any():
-        found["lens"] = seen.whitening @ _by_lens(scene, seen, in_camera)
+        found["lens"] = seen.whitening @ by_lens(scene.models, scene.free_lenses, seen.camera, in_camera)
     return {kind: np.nan_to_num(part) for kind, part in found.items()}
 
 
-def _by_motion(points_m: Float[Array, "n 3"]) -> Float[Array, "n 3 6"]:
-    """d (exp([w, t]^) x) / d (w, t) = [-[x]_x, 1]."""
-    x, y, z = points_m.T
-    zero, one = np.zeros_like(x), np.ones_like(x)
-    return np.stack(
-        [
-            np.stack([zero, z, -y, one, zero, zero], -1),
-            np.stack([-z, zero, x, zero, one, zero], -1),
-            np.stack([y, -x, zero, zero, zero, one], -1),
-        ],
-        1,
-    )
-
-
-def _by_point(
-    models: Sequence[CameraModel], camera: Int[Array, " n"], points_m: Float[Array, "n 3"]
-) -> Float[Array, "n 2 3"]:
-    step = 1e-5
-    columns = []
-    for axis in range(3):
-        ahead = np.eye(3)[axis] * step
-        up, down = (_projected(models, camera, points_m + sign * ahead) for sign in (1, -1))
-        columns.append((up - down) / (2 * step))
-    return np.stack(columns, -1)
-
-
-def _by_lens(scene: Scene, seen: Observations, in_camera: Float[Array, "n 3"]) -> Float[Array, "n 2 k"]:
-    most = max(len(lens_numbers(m)) for m in scene.models)
-    out = np.zeros((len(seen), 2, most))
-    for number in np.flatnonzero(scene.free_lenses).tolist():
-        mine = seen.camera == number
-        numbers = lens_numbers(scene.models[number])
-        for k in range(len(numbers)):
-            step = 1e-3 if k < 4 else 1e-6
-            ahead = np.eye(len(numbers))[k] * step
-            up, down = (with_lens(scene.models[number], numbers + s * ahead).project(in_camera[mine]) for s in (1, -1))
-            out[mine, :, k] = (up - down) / (2 * step)
-    return out
-
-
 def _normal(
-    jacobian: sparse.csr_matrix, residual: Float[Array, "n 2"], weight: Float[Array, " n"]
+    jacobian: sparse.csr_matrix,
+    residual: Float[Array, "n 2"],
+    weight: Float[Array, " n"],
+    scene: Scene,
+    blocks: Mapping[tuple[str, int], slice],
 ) -> tuple[Float[Array, "u u"], Float[Array, " u"]]:
+    """Of what was seen, and of where marks are known to lie beforehand."""
     weights = np.repeat(weight, 2)
     weighted = jacobian.multiply(weights[:, None]).tocsr()
-    return (jacobian.T @ weighted).toarray(), weighted.T @ residual.ravel()
+    normal, gradient = (jacobian.T @ weighted).toarray(), weighted.T @ residual.ravel()
+    for kind, values, std in _known_beforehand(scene):
+        where = np.arange(values.size) + blocks[kind, 0].start
+        normal[where, where] += 1 / std**2
+        gradient[where] += values.ravel() / std**2
+    return normal, gradient
+
+
+def _prior_cost(scene: Scene) -> float:
+    return sum((float((values**2).sum()) / std**2 for _, values, std in _known_beforehand(scene)), 0.0)
 
 
 def _solve(normal: Float[Array, "u u"], gradient: Float[Array, " u"], damping: float) -> Float[Array, " u"]:
@@ -324,6 +325,7 @@ def _moved(scene: Scene, blocks: Mapping[tuple[str, int], slice], step: Float[Ar
         "piece": scene.body_from_piece.copy(),
     }
     models, scale = list(scene.models), scene.scale.copy()
+    slight = {"mark": scene.shift_m.copy(), "image": scene.slip_px.copy()}
     for (kind, number), where in blocks.items():
         if kind == "lens":
             moved = lens_numbers(models[number]) + step[where]
@@ -332,12 +334,16 @@ def _moved(scene: Scene, blocks: Mapping[tuple[str, int], slice], step: Float[Ar
             models[number] = with_lens(models[number], moved)
         elif kind == "scale":
             scale[number] *= np.exp(step[where][0] / scale[number])
+        elif kind in slight:
+            slight[kind][number] += step[where]
         else:
             poses[kind][number] = exp_poses(step[where][None])[0] @ poses[kind][number]
     return replace(
         scene,
         models=tuple(models),
         scale=scale,
+        shift_m=slight["mark"],
+        slip_px=slight["image"],
         camera_from_rig=poses["camera"],
         rig_from_body=poses["view"],
         body_from_piece=poses["piece"],

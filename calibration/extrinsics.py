@@ -15,11 +15,10 @@ from jaxtyping import Bool, Float
 from numpy import ndarray as Array
 
 from calibration.bundle import Observations, Scene, Solved, adjust
-from calibration.pnp import most_agreed, poses_of_points
+from calibration.pnp import connected, poses_of_points
 from calibration.poses import angle_deg, inverse_poses
 from calibration.report import Finding, Report, limit
-from calibration.targets import TargetView
-from recordings.errors import BadInput
+from calibration.targets import TargetView, numbered_marks
 from recordings.geometry import CameraModel, Transform
 
 LEAST_POINTS = 8
@@ -37,6 +36,10 @@ UNDETERMINED = 1e-9
 BOARD, TABLE = 0, 1
 TABLE_PX = 0.8
 BOARD_SCALE = 0.003
+PRINT_M = 1.5e-4
+"""A printed mark lies where it should be within this (standard deviation by axis): printer, paper, plate."""
+STEADY_PX = 0.05
+"""A camera's image of one view is off as a whole by as much: nobody holds a board quite still while cameras expose."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +102,7 @@ def calibrate_cameras(
         {
             "views": {n: f["views"] for n, f in figures.items()},
             "points": len(seen),
-            "board_scale": float(solved.scene.scale[BOARD]) if solved.scene.free_scales[BOARD] else None,
+            "board_scale": _printed_scale(solved, seen) if solved.scene.free_scales[BOARD] else None,
         },
     )
     return PlacedCameras(
@@ -146,6 +149,7 @@ class _Setup:
                 rig_from_body[view] = inverse_poses(camera_from_rig[self.names.index(n)]) @ candidates[0]
                 known[view] = True
         cameras, pieces = len(self.names), np.zeros(2, dtype=bool)
+        _, marks = numbered_marks([(piece, view) for _, _, piece, view in self.parts])
         return Scene(
             tuple(self.models[n] for n in self.names),
             camera_from_rig,
@@ -157,16 +161,27 @@ class _Setup:
             np.zeros(cameras, dtype=bool),
             np.ones(2),
             np.array([bool(self.still), False]),
+            np.zeros((marks, 3)),
+            PRINT_M,
+            np.zeros((len(self.parts), 2)),
+            STEADY_PX,
         )
 
-    def observations(self, scene: Scene) -> Observations:
+    @cached_property
+    def parts(self) -> list[tuple[int, int, int, TargetView]]:
+        """Every image in which enough is seen: camera, view, piece, what."""
         parts = [
             (k, number, BOARD, view)
             for k, n in enumerate(self.names)
             for number, view in enumerate(self.views[n])
-            if len(view) >= LEAST_POINTS and scene.free_views[number]
+            if len(view) >= LEAST_POINTS
         ]
-        parts += [(self.names.index(n), self.count, TABLE, view) for n, view in self.still.items()]
+        return parts + [(self.names.index(n), self.count, TABLE, view) for n, view in self.still.items()]
+
+    def observations(self, scene: Scene) -> Observations:
+        marks, _ = numbered_marks([(piece, view) for _, _, piece, view in self.parts])
+        used = [i for i, (_, number, piece, _) in enumerate(self.parts) if piece == TABLE or scene.free_views[number]]
+        parts = [self.parts[i] for i in used]
         counts = [len(view) for *_, view in parts]
         return Observations(
             np.repeat([p[0] for p in parts], counts).astype(np.int64),
@@ -175,6 +190,8 @@ class _Setup:
             np.concatenate([view.points_m for *_, view in parts]),
             np.concatenate([view.pixels for *_, view in parts]),
             whitening(np.concatenate([view.covariance_px2 for *_, view in parts])),
+            np.concatenate([marks[i] for i in used]),
+            np.repeat(used, counts).astype(np.int64),
         )
 
 
@@ -219,11 +236,20 @@ def _table_or_not(setup: _Setup) -> tuple[list[Finding], _Setup]:
             f"the table's tags do not lie where they are said to (residual {rms:.2f} px, wanted {TABLE_PX:g}): not used"
         )
         return [Finding("warning", f"{text}; measure their places, or run `toss-calibrate table`")], without
-    scale = float(solved.scene.scale[BOARD])
+    scale = _printed_scale(solved, seen)
     if abs(scale - 1) > BOARD_SCALE:
         text = f"the board is {100 * scale:.2f} % of the size it is said to be, by the table's tags"
         return [Finding("warning", f"{text}; measure its tags and correct size_m")], setup
     return [], setup
+
+
+def _printed_scale(solved: Solved, seen: Observations) -> float:
+    """Size of the board as it is, marks shifted as they are, to the size it is said to be."""
+    on_board = seen.piece == BOARD
+    assert seen.mark is not None
+    said_m = seen.points_m[on_board]
+    true_m = solved.scene.scale[BOARD] * said_m + solved.scene.shift_m[seen.mark[on_board]]
+    return float(np.sqrt((true_m.var(axis=0)).sum() / said_m.var(axis=0).sum()))
 
 
 def board_pose(model: CameraModel, view: TargetView) -> list[Float[Array, "4 4"]]:
@@ -232,34 +258,6 @@ def board_pose(model: CameraModel, view: TargetView) -> list[Float[Array, "4 4"]
         return []
     found = poses_of_points(model, view.points_m, view.pixels)
     return [pose for pose, error in found if error < 1.5 * found[0][1] + 0.05]
-
-
-def connected(
-    names: Sequence[str], poses: Mapping[str, Sequence[Sequence[Float[Array, "4 4"]]]]
-) -> Float[Array, "c 4 4"]:
-    """camera_from_rig, the rig being the first camera, by chaining relative poses that many views agree on.
-
-    Raises BadInput naming the cameras that share too few views with the others.
-    """
-    found = {names[0]: np.eye(4)}
-    while len(found) < len(names):
-        best: tuple[int, str, Array] | None = None
-        for here, there in ((a, b) for a in found for b in names if b not in found):
-            looks = [
-                [there_pose @ inverse_poses(here_pose) for there_pose in q for here_pose in p]
-                for p, q in zip(poses[here], poses[there])
-            ]
-            agreed = most_agreed([look for look in looks if look], 5.0, 0.05)
-            if agreed is not None and (best is None or agreed[1] > best[0]):
-                best = (agreed[1], there, agreed[0] @ found[here])
-        if best is None or best[0] < min(2, LEAST_VIEWS):
-            cut = [n for n in names if n not in found]
-            raise BadInput(
-                f"degenerate geometry: {', '.join(cut)} shares no views of the board with {', '.join(found)}, so its "
-                "place is undetermined; record views in which both see the board: `toss-record --calibration board`"
-            )
-        found[best[1]] = best[2]
-    return np.array([found[n] for n in names])
 
 
 def _without_bad_views(scene: Scene, seen: Observations) -> tuple[Solved, Observations, list[tuple[int, int]]]:
@@ -357,7 +355,9 @@ def _hold_out(setup: _Setup, full: Solved) -> dict[str, float]:
         moves_mm += [1e3 * float(np.linalg.norm(m[:3, 3])) for m in moved[1:]]
         turns_deg += [angle_deg(m[:3, :3]) for m in moved[1:]]
         fixed = np.zeros(len(setup.names), dtype=bool)
-        scene = replace(rest.scene, free_cameras=fixed, free_lenses=fixed, free_scales=np.zeros(2, dtype=bool))
+        scene = replace(
+            rest.scene, free_cameras=fixed, free_lenses=fixed, free_scales=np.zeros(2, dtype=bool), print_m=None
+        )
         kept = replace(scene, free_views=full.scene.free_views & aside)
         seen = replace(setup, still={}).observations(kept)
         if len(seen):

@@ -16,10 +16,11 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray as Array
 
-from calibration.bundle import Observations, Scene, Solved, adjust, lens_numbers, with_lens
-from calibration.extrinsics import AS_GOOD, LEAST_POINTS, bad_views, board_pose, whitening
+from calibration.bundle import Observations, Scene, Solved, adjust
+from calibration.extrinsics import AS_GOOD, LEAST_POINTS, PRINT_M, bad_views, board_pose, whitening
+from calibration.projected import lens_numbers, with_lens
 from calibration.report import Finding, Report, limit
-from calibration.targets import TargetView
+from calibration.targets import TargetView, numbered_marks
 from recordings.errors import BadInput
 from recordings.geometry import COEFFICIENTS, CameraModel, DistortionModel
 
@@ -90,7 +91,8 @@ def calibrate_intrinsics(
 def _kept(camera: str, given: CameraModel, fit: _Fit, views: Sequence[TargetView]) -> Lens | None:
     """The given lens, where it explains the views as well as the fitted one does views that it has not seen: few views,
     or views of the image's middle only, know a lens less well than its maker."""
-    solved, seen = _solve(given, views, [v for v in range(len(views)) if v not in fit.rejected], free_lens=False)
+    numbers = [v for v in range(len(views)) if v not in fit.rejected]
+    solved, seen = _solve(given, views, numbers, free_lens=False)
     if solved.rms_px > AS_GOOD * fit.hold_out_px:
         return None
     text = (
@@ -147,14 +149,20 @@ class _Fit:
         for fold in range(FOLDS):
             aside = numbers[fold::FOLDS]
             rest, _ = _solve(solved.scene.models[0], views, [v for v in numbers if v not in aside])
-            gaps.append(_solve(rest.scene.models[0], views, aside, free_lens=False)[0].residual_px)
+            known = rest.scene
+            gaps.append(_solve(known.models[0], views, aside, known.shift_m)[0].residual_px)
         return _Fit(solved, seen, rejected, float(np.sqrt((np.concatenate(gaps) ** 2).mean())))
 
 
 def _solve(
-    start: CameraModel, views: Sequence[TargetView], numbers: Sequence[int], free_lens: bool = True
+    start: CameraModel,
+    views: Sequence[TargetView],
+    numbers: Sequence[int],
+    shift_m: Float[Array, "m 3"] | None = None,
+    free_lens: bool = True,
 ) -> tuple[Solved, Observations]:
-    """Lens (where free) and board poses from the views of these numbers."""
+    """Lens (where free), board poses and what the board's print is off, from the views of these numbers; with that
+    print known (`shift_m`) the poses alone."""
     poses, chosen = np.tile(np.eye(4), (len(views), 1, 1)), []
     for v in numbers:
         found = board_pose(start, views[v])
@@ -164,6 +172,7 @@ def _solve(
     if not chosen:
         raise BadInput(f"no pose of the board fits the views of {start.frame}; is its layout as stated?")
     counts = [len(views[v]) for v in chosen]
+    marks, many = numbered_marks([(0, view) for view in views])
     seen = Observations(
         np.zeros(sum(counts), dtype=np.int64),
         np.repeat(chosen, counts),
@@ -171,10 +180,12 @@ def _solve(
         np.concatenate([views[v].points_m for v in chosen]),
         np.concatenate([views[v].pixels for v in chosen]),
         whitening(np.concatenate([views[v].covariance_px2 for v in chosen])),
+        np.concatenate([marks[v] for v in chosen]),
     )
     one, no = np.eye(4)[None], np.zeros(1, dtype=bool)
-    free_views = np.isin(np.arange(len(views)), chosen)
-    scene = Scene((start,), one, poses, one, no, free_views, no, np.array([free_lens]), np.ones(1), no)
+    free_views, lens = np.isin(np.arange(len(views)), chosen), np.array([free_lens and shift_m is None])
+    shift, print_m = (np.zeros((many, 3)), PRINT_M) if shift_m is None else (shift_m, None)
+    scene = Scene((start,), one, poses, one, no, free_views, no, lens, np.ones(1), no, shift, print_m)
     return adjust(scene, seen), seen
 
 

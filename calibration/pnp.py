@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import cv2
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray as Array
 
+from calibration.poses import inverse_poses
+from recordings.errors import BadInput
 from recordings.geometry import CameraModel
 
 FLAT = 1e-4
 """Points this near to a plane, as a share of their spread, are flat."""
 LEAST_POINTS = 4
+LEAST_SHARED = 2
+"""Views that two cameras must share to be connected by them."""
 
 
 def poses_of_points(
@@ -75,3 +79,31 @@ def _near(stack: Float[Array, "n 4 4"], turn_deg: float, shift_m: float) -> Arra
     cosine = (np.einsum("aij,bij->ab", stack[:, :3, :3], stack[:, :3, :3]) - 1) / 2
     shift = np.linalg.norm(stack[:, None, :3, 3] - stack[None, :, :3, 3], axis=2)
     return (cosine > np.cos(np.radians(turn_deg))) & (shift < shift_m)
+
+
+def connected(
+    names: Sequence[str], poses: Mapping[str, Sequence[Sequence[Float[Array, "4 4"]]]]
+) -> Float[Array, "c 4 4"]:
+    """camera_from_rig, the rig being the first camera, by chaining relative poses that many views agree on.
+
+    Raises BadInput naming the cameras that share too few views with the others.
+    """
+    found = {names[0]: np.eye(4)}
+    while len(found) < len(names):
+        best: tuple[int, str, Array] | None = None
+        for here, there in ((a, b) for a in found for b in names if b not in found):
+            looks = [
+                [there_pose @ inverse_poses(here_pose) for there_pose in q for here_pose in p]
+                for p, q in zip(poses[here], poses[there])
+            ]
+            agreed = most_agreed([look for look in looks if look], 5.0, 0.05)
+            if agreed is not None and (best is None or agreed[1] > best[0]):
+                best = (agreed[1], there, agreed[0] @ found[here])
+        if best is None or best[0] < LEAST_SHARED:
+            cut = [n for n in names if n not in found]
+            raise BadInput(
+                f"degenerate geometry: {', '.join(cut)} shares no views of the board with {', '.join(found)}, so its "
+                "place is undetermined; record views in which both see the board: `toss-record --calibration board`"
+            )
+        found[best[1]] = best[2]
+    return np.array([found[n] for n in names])

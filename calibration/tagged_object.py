@@ -17,8 +17,8 @@ from jaxtyping import Float, Int64
 from numpy import ndarray as Array
 
 from calibration.bundle import Observations, Scene, Solved, adjust
-from calibration.extrinsics import connected, whitening
-from calibration.pnp import most_agreed, poses_of_points, rms_px
+from calibration.extrinsics import whitening
+from calibration.pnp import connected, most_agreed, poses_of_points, rms_px
 from calibration.poses import inverse_poses
 from calibration.tags import TagDetection
 from calibration.targets import CORNERS

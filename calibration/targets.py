@@ -71,12 +71,27 @@ class TargetView:
     points_m: Float[Array, "n 3"]
     pixels: Float[Array, "n 2"]
     covariance_px2: Float[Array, "n 2 2"]
+    marks: Int[Array, " n"] | None = None
+    """Which printed mark each point belongs to (a tag has four points); None: each is one of its own."""
 
     def __len__(self) -> int:
         return len(self.ids)
 
+    @property
+    def printed(self) -> Int[Array, " n"]:
+        """The printed mark of each point."""
+        return self.ids if self.marks is None else self.marks
+
 
 NOTHING = TargetView(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 2)), np.zeros((0, 2, 2)))
+
+
+def numbered_marks(views: Sequence[tuple[int, TargetView]]) -> tuple[list[Int[Array, " n"]], int]:
+    """The printed mark of every point of every view, counted from 0, and how many there are. Each view comes with the
+    number of the thing that the marks are printed on: marks of the first thing are counted first."""
+    marks = [(thing << 32) + view.printed.astype(np.int64) for thing, view in views]
+    known = np.unique(np.concatenate([np.zeros(0, np.int64), *marks]))
+    return [np.searchsorted(known, mine).astype(np.int64) for mine in marks], len(known)
 
 
 def find_target(
@@ -88,7 +103,9 @@ def find_target(
 ) -> list[TargetView]:
     """The target in every image; views without points where it is not seen."""
     if isinstance(target, Tags):
-        lists = detect_tags(images, target.family, cache, progress, response=response, total=len(images))
+        lists = detect_tags(
+            images, target.family, cache, progress, response=response, total=len(images), refinement="pattern"
+        )
         return [tag_view(target, tags) for tags in lists]
     if isinstance(target, Charuco):
         return _find_charuco(target, images)
@@ -106,6 +123,7 @@ def tag_view(target: Tags, found: Sequence[TagDetection]) -> TargetView:
         np.concatenate([target.corners_m(t.tag_id) for t in mine]),
         np.concatenate([t.corners_px for t in mine]),
         np.concatenate([t.covariance_px2 for t in mine]),
+        np.repeat([t.tag_id for t in mine], 4),
     )
 
 

@@ -106,7 +106,9 @@ def _find_both(
 ) -> tuple[list[TargetView], list[TargetView]]:
     response = response_of(camera)
     if isinstance(target, Tags) and (table is None or table.family == target.family):
-        lists = detect_tags(images, target.family, cache, progress, response=response, total=len(images))
+        lists = detect_tags(
+            images, target.family, cache, progress, response=response, total=len(images), refinement="pattern"
+        )
         on_table = [tag_view(table, tags) if table else NOTHING for tags in lists]
         return [tag_view(target, tags) for tags in lists], on_table
     board = find_target(target, images, response, cache, progress)

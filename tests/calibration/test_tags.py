@@ -21,7 +21,7 @@ FAMILY = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
 SQUARE = 0.5 * np.array([[-1.0, 1.0], [1.0, 1.0], [1.0, -1.0], [-1.0, -1.0]])
 
 
-def drawn(tag_id, side, seed, blur_px=0.0, noise=2.0, family=FAMILY):
+def drawn(tag_id, side, seed, blur_px=0.0, noise=2.0, family=FAMILY, spill_px=0.0):
     """A tag turned and tilted anyhow, drawn six times too large and averaged; and where its corners are (the detector's
     order, OpenCV's pixels)."""
     rng, scale = np.random.default_rng(seed), 6
@@ -41,6 +41,8 @@ def drawn(tag_id, side, seed, blur_px=0.0, noise=2.0, family=FAMILY):
         total += cv2.warpPerspective(
             texture, cv2.getPerspectiveTransform(source, target), total.shape, borderValue=120.0, flags=cv2.INTER_AREA
         )
+    if spill_px:
+        total = cv2.dilate(total, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * round(spill_px * scale) + 1,) * 2))
     image = cv2.GaussianBlur(total.reshape(size, scale, size, scale).mean(axis=(1, 3)) / steps, (0, 0), 0.5)
     return np.clip(np.rint(image + rng.normal(0, noise, image.shape)), 0, 255).astype(np.uint8), corners
 
@@ -63,6 +65,26 @@ def test_covariances_say_how_far_corners_are_off_in_noisy_pictures():
     gaps, covariance = errors([drawn(k, 40.0, k, noise=20.0) for k in range(25)])
     squares = np.einsum("tki,tkij,tkj->tk", gaps, np.linalg.inv(covariance), gaps) / 2
     assert 0.5 < squares.mean() < 1.6
+
+
+def flat(cases):
+    """The same tags, so tilted that their cells are less than two pixels wide one way."""
+    out = []
+    for image, corners in cases:
+        squeeze = np.array([[1.0, 0, 0], [0, 0.55, 0.45 * corners[:, 1].mean()]])
+        tilted = cv2.warpAffine(image, squeeze, image.shape[::-1], flags=cv2.INTER_AREA)
+        out.append((tilted, corners @ squeeze[:, :2].T + squeeze[:, 2]))
+    return out
+
+
+def test_the_whole_pattern_tells_corners_where_cells_are_small_and_where_light_spills():
+    cases = flat([drawn(k, 26.0, k, noise=3.0) for k in range(12)])
+    outline, whole = (errors(cases, refinement=way)[0] for way in ("edges", "pattern"))
+    assert np.sqrt((whole**2).mean()) < 0.06
+    assert np.sqrt((whole**2).mean()) < 0.7 * np.sqrt((outline**2).mean())
+    spilled = [drawn(k, 60.0, k, spill_px=0.35, noise=3.0) for k in range(6)]
+    outline, whole = (errors(spilled, refinement=way)[0] for way in ("edges", "pattern"))
+    assert np.sqrt((whole**2).mean()) < 0.08 < 0.3 < np.sqrt((outline**2).mean())
 
 
 @pytest.mark.slow
