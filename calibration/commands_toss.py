@@ -141,7 +141,7 @@ def cameras_from_object(path: Path, args: argparse.Namespace, progress: Progress
                 "--from object needs a toss seen by two or more mono cameras, and --tag-size "
                 "(side of the object's tags, m)"
             )
-        tags = read_toss_tags(session, number, store.work_folder(session), progress)
+        tags = read_toss_tags(session, number, store.work_folder(session), progress, refinement="pattern")
         cameras = mono_cameras(session, list(tags.tags))
         of_object = tags.of_object(tag_ids(args), table_target(session.calibration))
         sightings, times_ns = triggered(tags, of_object, cameras)

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float, Int64, UInt8
 from numpy import ndarray as Array
 
-from calibration.tags import Response, TagDetection, detect_tags
+from calibration.tags import Refinement, Response, TagDetection, detect_tags
 from calibration.targets import NOTHING, Tags, Target, TargetView, find_target, tag_view, target_from_document
 from recordings import codec
 from recordings.errors import BadInput
@@ -169,14 +169,26 @@ class TossTags:
         return {c: [[t for t in tags if mine(t)] for tags in lists] for c, lists in self.tags.items()}
 
 
-def read_toss_tags(session: Session, number: int, cache: Path | None, progress: Progress | None = None) -> TossTags:
+def read_toss_tags(
+    session: Session,
+    number: int,
+    cache: Path | None,
+    progress: Progress | None = None,
+    refinement: Refinement = "edges",
+) -> TossTags:
     """All tags in all cameras of a toss."""
     toss = session.toss(number)
     times, tags = {}, {}
     for camera in toss.cameras():
         times[camera], images = grey_images(toss, camera)
         tags[camera] = detect_tags(
-            images, session.calibration.tag_family, cache, progress, response=response_of(camera), total=len(images)
+            images,
+            session.calibration.tag_family,
+            cache,
+            progress,
+            response=response_of(camera),
+            total=len(images),
+            refinement=refinement,
         )
     return TossTags(number, times, tags)
 
