@@ -20,7 +20,7 @@ from processing.track.register import register_tosses
 from processing.track.sequence import track_toss
 from processing.vision import CAMERA
 from recordings.geometry import Transform
-from recordings.results import read_masks, read_shape, read_track, write_masks, write_shape, write_track
+from recordings.results import RobotMasks, read_masks, read_shape, read_track, write_masks, write_shape, write_track
 from recordings.tracks import ObjectShape, ObjectTrack
 
 if TYPE_CHECKING:
@@ -201,8 +201,8 @@ def second_field(
         views, body = [], read_shape(shape.folder)
         for toss, track in tracks.items():
             frames = second_frames(run, toss, read_track(drawn.folder, toss), body, masks[toss])
-            own = read_track(track.folder, toss)
-            views.append(TossViews(frames, frames.depth_times_ns, frames.masks, own, frames.colorless))
+            own, robot = read_track(track.folder, toss), RobotMasks.of(masks[toss].folder, toss)
+            views.append(TossViews(frames, frames.depth_times_ns, frames.masks, own, frames.colorless, robot))
         progress = run.progress(f"{name}: shape, second pass")
         believed = body if run.config.cycle.start == "shape" else None
         learned, used = learn_shape(views, run.camera, run.config.shape, run.device, progress, believed)
@@ -210,7 +210,7 @@ def second_field(
         return {"views": used, "vertices": len(learned.vertices_m)}
 
     config = {"shape": plain(run.config.shape), "start": run.config.cycle.start}
-    return run.store.run("field", 3, config, inputs, compute)
+    return run.store.run("field", 5, config, inputs, compute)
 
 
 def input_keys(tracks: Mapping[int, Done], masks: Mapping[int, Done]) -> dict[str, str]:

@@ -33,7 +33,7 @@ class ContradictionConfig:
     """Views of the joined tosses that take part, spread over directions."""
     seek: Schedule = ((1, 6, 0.012, 0.5, 0.02, 0.125),)
     coarse: Schedule = ((1, 4, 0.008, 0.4, 0.012, 0.125), (0, 4, 0.005, 0.3, 0.006, 0.25))
-    fine: Schedule = ((0, 6, 0.003, 0.2, 0.004, 0.5), (0, 4, 0.003, 0.2, 0.003, 1.0))
+    fine: Schedule = ((0, 6, 0.003, 0.2, 0.004, 0.25), (0, 4, 0.003, 0.2, 0.003, 0.5))
     judged: Schedule = ((0, 1, 0.003, 0.3, 0.002, 1.0),)
     """The scales at which a placement is judged: so much is a clear contradiction by a third."""
     rim_share: float = 0.25
