@@ -244,7 +244,7 @@ def _fused(
     begin = np.concatenate([points.ravel() / SCALE_M, learning.fit.parameters[FRICTION:]])
     found = fit_lbfgs(model, begin, learning.data, learning.weights, 20)
     slow = slow_friction(model, found.parameters, learning.prepared, contact_config)
-    found, spread = with_friction(found, learning.spread, slow, model)
+    found, spread = with_friction(found, learning.spread, slow)
     moved = replace(prior, geometry=model.geometry)
     contact, _, friction, sizes = results_of(model, found.parameters, spread, moved, physics, plane, learning.touched)
     return replace(

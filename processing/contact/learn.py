@@ -12,12 +12,12 @@ from jaxtyping import Bool, Float
 from numpy import ndarray as Array
 
 from processing.contact import data_checks as checks
-from processing.contact.fit import FRICTION, SHAPE, Fit, FitConfig, Model, fit
-from processing.contact.friction import LikelyFriction, frames_are_slow, likely_friction
+from processing.contact.fit import FRICTION, Fit, FitConfig, Model, fit
+from processing.contact.forecast import RigidBody
+from processing.contact.friction import ForecastFriction, frames_are_slow, friction_by_forecasts
 from processing.contact.geometry import GeometryName
 from processing.contact.inertia import Physics
 from processing.contact.intervals import Interval, Spread, bootstrap, curvature, extents, plane_sensitivity
-from processing.contact.likelihood import RigidBody
 from processing.contact.loss import REFERENCE_MASS_KG, Body, StepData, Weights, contact_loss
 from processing.contact.motion import PoseSeries, Steps
 from processing.contact.plane import Plane
@@ -43,7 +43,7 @@ class ContactConfig:
     is 1 to 3 % too large with 1; with 20 it is as much too small where poses are 3 mm off, which rollouts mind.)"""
     one_toss_dissipation: float = 30.0
     """Of a single toss, from which nothing can be held out."""
-    likely_friction: bool = True
+    friction_by_forecasts: bool = True
     """Where frames are far apart, the weights are chosen and there are tosses enough: friction.py instead of the
     loss's."""
     bootstrap_repeats: int = 16
@@ -134,7 +134,7 @@ def learn_contact(
     progress.step(4, 6, "intervals")
     sensitivity = plane_sensitivity(fitted, optimum, data, weights)
     progress.step(5, 6, "sensitivity")
-    last, spread = with_friction(fits[-1], spread, slow, fitted)
+    last, spread = with_friction(fits[-1], spread, slow)
     optimum = last.parameters
     body = fitted.numbers(optimum)
     touched = touched_points(fitted, body, data, weights)
@@ -228,28 +228,25 @@ def _choose_weights(
 
 def slow_friction(
     fitted: Model, optimum: Float[Array, " p"], prepared: Prepared, config: ContactConfig
-) -> LikelyFriction | None:
-    """The most likely friction where it is better than the loss's; None where it is not, or not asked for."""
-    if config.weights is not None or not config.likely_friction or not frames_are_slow(prepared.tracks):
+) -> ForecastFriction | None:
+    """The friction by forecasts where it is better than the loss's; None where it is not, or not asked for."""
+    if config.weights is not None or not config.friction_by_forecasts or not frames_are_slow(prepared.tracks):
         return None
     body = fitted.numbers(optimum)
     center, inertia = body.center_m.cpu().numpy(), body.inertia_kgm2.cpu().numpy()
     points = body.points_m.cpu().numpy() - center
     tracks = [t.about(center).turned(np.eye(3), float(body.plane_m)) for t in prepared.tracks]
     rigid = RigidBody(points, fitted.geometry.contacts, inertia)
-    return likely_friction(rigid, tracks, prepared.smoothed, config.seed)
+    return friction_by_forecasts(rigid, tracks, prepared.smoothed, config.seed)
 
 
-def with_friction(done: Fit, spread: Spread, slow: LikelyFriction | None, fitted: Model) -> tuple[Fit, Spread]:
-    """A fit and its intervals with the most likely friction, where there is one; and with the size that goes with it,
-    where size was learned and no prior holds the points."""
+def with_friction(done: Fit, spread: Spread, slow: ForecastFriction | None) -> tuple[Fit, Spread]:
+    """A fit and its intervals with the friction by forecasts, where there is one."""
     if slow is None:
         return done, spread
     parameters = done.parameters.copy()
     parameters[FRICTION] = slow.value**0.5
-    if fitted.config.learn_shape and fitted.sigma_m is None:
-        parameters[SHAPE] = (parameters[SHAPE].reshape(-1, 3) * slow.trial.stretch).ravel()
-    method = f"{spread.method}; friction by likelihood"
+    method = f"{spread.method}; friction by forecasts"
     return replace(done, parameters=parameters), replace(spread, method=method, friction=slow.half_width)
 
 

@@ -1,4 +1,4 @@
-"""Rolling many states on through contact in fine steps, in compiled code: what the friction filter does with them.
+"""Rolling many states on through contact in fine steps, in compiled code: what forecasts are made of.
 
 The step is that of rollout.py (Anitescu 2006; implicit Euler; the same inner problem) but for two things. A point that
 reaches the plane faster than SLOWEST_REBOUND_M_S leaves it with `restitution` times that speed (Newton's rule); and a
@@ -134,28 +134,28 @@ def _turn(rotation, spin, step_s, E):
 @no_type_check
 def roll_rows(rotation, position, spin, velocity, owner, laws, points, inertia, mass, contacts, steps, step_s):
     """Moves n states on by `steps` of `step_s`, in place: rotation (n, 3, 3), position, spin (object axes) and velocity
-    (n, 3). `owner` (n,) says which of m bodies each is of: laws (m, 2) their friction and restitution, points
-    (m, v, 3) about the centre of mass; inertia and mass are the same for all.
+    (n, 3). `owner` (n,) says which of m laws (friction, restitution) each obeys; `points` (v, 3) are the body's, about
+    its centre of mass.
 
     Returns the change of speed that contact made in each (n,), and how many inner problems did not solve.
     """
     n, failures = len(position), 0
     inverse = np.linalg.inv(inertia)
     root, root_mass = np.linalg.cholesky(inverse), mass**0.5
-    reach = np.sqrt((points**2).sum(2).max())
-    heights, index = np.zeros(points.shape[1]), np.zeros(contacts, dtype=np.int64)
+    reach = np.sqrt((points**2).sum(1).max())
+    heights, index = np.zeros(len(points)), np.zeros(contacts, dtype=np.int64)
     A, q, primal = np.zeros((1, 3 * contacts, 6)), np.zeros((1, 3 * contacts)), np.zeros((1, 6))
     work, out, E, momentum, pushed = np.zeros(3), np.zeros(3), np.zeros((3, 3)), np.zeros(6), np.zeros(n)
     for r in range(n):
-        R, w, v, body = rotation[r], spin[r], velocity[r], points[owner[r]]
+        R, w, v = rotation[r], spin[r], velocity[r]
         friction, restitution = laws[owner[r], 0], laws[owner[r], 1]
         primal[:] = 0.0
         for _ in range(steps):
             _fly(w, v, inertia, inverse, step_s, work, out)
             if position[r, 2] < reach * (1 + step_s * (w[0] ** 2 + w[1] ** 2 + w[2] ** 2) ** 0.5) - step_s * v[2]:
-                _lowest(R, position[r, 2], body, contacts, heights, index)
+                _lowest(R, position[r, 2], points, contacts, heights, index)
                 count, needed = _problem(
-                    R, w, v, body, heights, index, friction, restitution, root, root_mass, step_s, A, q
+                    R, w, v, points, heights, index, friction, restitution, root, root_mass, step_s, A, q
                 )
                 if needed:
                     impulse, failed, _ = solve_rows(
