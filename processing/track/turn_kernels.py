@@ -1,9 +1,8 @@
-"""Compiled comparison of two views over all turns about one line: what a round body's depth cannot tell.
+"""Compiled search over a round body's turns: what two views laid out about the axis say for each turn between them, and
+the moves that lower what all pairs and the change of spin cost together.
 
-The usual residuals (kernels.py) pull a round body towards no turn at all: its limb, its shading and the noise of its
-normals stay with the picture. Here a turn is judged only by what contradicts it: points beside the other view's
-outline, points in front of what it sees, and looks that differ where both views face the surface well. What is hidden
-counts for nothing.
+Turns are whole cells of the layout. A view turned by `state` cells shows at angle a what it laid out at a + state; so a
+pair's say depends on the difference of the two states.
 """
 
 from __future__ import annotations
@@ -13,110 +12,251 @@ from typing import no_type_check
 import numpy as np
 from numba import njit
 
-from processing.track import kernels as k
-
-OFFSET, U0, V0, WIDTH, HEIGHT, FIRST, COUNT = range(7)
-BRIGHT_SHARE = 0.3
-FACING_LOW, FACING_HIGH = 0.3, 0.8
-"""Looks of a surface that faces the camera by less than the first cosine count nothing, by the second in full."""
-HIDDEN = 0.1
-"""Of a point off the round body, where it is hidden: what is seen there once should be seen again."""
-LEAST_LOOKS = 20.0
-"""Points whose looks must be comparable; fewer tell less."""
+LEAST_SURE, MOST_SURE = 1.0, 4.0
+"""Pixels of a cell; more than the second tell no more."""
+RAMPS = (2, 3, 4, 6, 8, 12)
+"""Over so many views a turn may grow."""
 
 
 @no_type_check
 @njit(cache=True, nogil=True, fastmath=True)
-def contradictions(samples, odd, step, pose, maps, row, focal, center, depth_m, outline_m, looks, out):
-    """Adds to `out` (violations, points that could violate, differences of looks, their weight) what `samples` say
-    against `pose` (4x4 other_from_sample camera). looks: scales of brightness and of colour differences."""
-    # long because: one compiled loop over points
-    off, u0, v0, w, h = row[OFFSET], row[U0], row[V0], row[WIDTH], row[HEIGHT]
-    for i in range(0, samples.shape[0], step):
-        p = samples[i]
-        x = pose[0, 0] * p[k.PX] + pose[0, 1] * p[k.PY] + pose[0, 2] * p[k.PZ] + pose[0, 3]
-        y = pose[1, 0] * p[k.PX] + pose[1, 1] * p[k.PY] + pose[1, 2] * p[k.PZ] + pose[1, 3]
-        z = pose[2, 0] * p[k.PX] + pose[2, 1] * p[k.PY] + pose[2, 2] * p[k.PZ] + pose[2, 3]
-        if z < 0.05:
-            continue
-        u, v = focal[0] * x / z + center[0] - u0, focal[1] * y / z + center[1] - v0
-        iu, iv = int(np.floor(u + 0.5)), int(np.floor(v + 0.5))
-        if iu < 1 or iv < 1 or iu >= w - 2 or iv >= h - 2:
-            out[0] += 1.0
-            continue
-        near = off + iv * w + iu
-        outside = maps[near, k.OUTSIDE]
-        if outside < 0.0:
-            out[0] += HIDDEN * odd[i]
-            continue
-        if outside > 0.0:
-            out[0] += min(max(outside * z / (focal[0] * outline_m) - 0.6, 0.0) / 2.0, 1.0)
-            continue
-        zr = maps[near, k.Z]
-        if zr <= 0.0:
-            out[0] += 0.5 * HIDDEN * odd[i]
-            continue
-        far = 1.0 / np.sqrt(x * x + y * y + z * z)
-        nx, ny, nz = maps[near, k.NX], maps[near, k.NY], maps[near, k.NZ]
-        theirs = -(nx * x + ny * y + nz * z) * far
-        ahead = (zr - z) / depth_m
-        if ahead > 3.0:
-            out[0] += min((ahead - 3.0) / 3.0, 1.0)
-            continue
-        if ahead < -3.0 / max(theirs, 0.3):
-            out[0] += HIDDEN * odd[i]
-            continue
-        mx = pose[0, 0] * p[k.SNX] + pose[0, 1] * p[k.SNY] + pose[0, 2] * p[k.SNZ]
-        my = pose[1, 0] * p[k.SNX] + pose[1, 1] * p[k.SNY] + pose[1, 2] * p[k.SNZ]
-        mz = pose[2, 0] * p[k.SNX] + pose[2, 1] * p[k.SNY] + pose[2, 2] * p[k.SNZ]
-        mine = -(mx * x + my * y + mz * z) * far
-        if mine < 0.1:
-            out[0] += HIDDEN * odd[i]
-            continue
-        own = -(p[k.SNX] * p[k.PX] + p[k.SNY] * p[k.PY] + p[k.SNZ] * p[k.PZ])
-        own /= np.sqrt(p[k.PX] ** 2 + p[k.PY] ** 2 + p[k.PZ] ** 2)
-        trust = (min(min(mine, theirs), own) - FACING_LOW) / (FACING_HIGH - FACING_LOW)
-        if trust <= 0.0 or p[k.SSHARP] > 0.5 * k.NO_LOOK:
-            continue
-        trust = min(trust, 1.0)
-        ju, jv = int(np.floor(u)), int(np.floor(v))
-        a, b = u - ju, v - jv
-        q = off + jv * w + ju
-        if max(max(maps[q, k.SHARP], maps[q + 1, k.SHARP]), max(maps[q + w, k.SHARP], maps[q + w + 1, k.SHARP])) > 50.0:
-            continue
-        apart = 0.0
-        for c in range(k.LOOKS):
-            ch = k.SMOOTH + c
-            there = (maps[q, ch] * (1 - a) + maps[q + 1, ch] * a) * (1 - b)
-            there += (maps[q + w, ch] * (1 - a) + maps[q + w + 1, ch] * a) * b
-            e = (there - p[k.SSHARP + k.LOOKS + c]) / looks[min(c, 1)]
-            apart += (BRIGHT_SHARE if c == 0 else 1.0) * min(e * e, 1.0)
-        out[2] += trust * apart / k.LOOKS
-        out[3] += trust
+def said_by_looks(looks, count, usual, pairs, sigma, outlier, dead, reach, out):
+    """Adds to out (m, 2 reach + 1) the log ratio of each pair's cells matching by that turn to cells matching at random
+    within their row (`usual`: log density of a cell's looks in its row). Ratios below `dead` are chance."""
+    cells = looks.shape[2]
+    norm = -np.log(4.0 * np.pi * sigma[0] * sigma[1])
+    low = np.log((np.exp(-dead) - outlier) / (1.0 - outlier))
+    high = np.log((np.exp(dead) - outlier) / (1.0 - outlier))
+    for m in range(pairs.shape[0]):
+        i, j = pairs[m, 0], pairs[m, 1]
+        for r in range(looks.shape[1]):
+            for a in range(cells):
+                if count[i, r, a] < LEAST_SURE:
+                    continue
+                for q in range(-reach, reach + 1):
+                    b = (a - q) % cells
+                    if count[j, r, b] < LEAST_SURE:
+                        continue
+                    one = (looks[i, r, a, 0] - looks[j, r, b, 0]) / sigma[0]
+                    two = (looks[i, r, a, 1] - looks[j, r, b, 1]) / sigma[1]
+                    match = norm - 0.25 * (one * one + two * two) - 0.5 * (usual[i, r, a] + usual[j, r, b])
+                    if low < match < high:
+                        continue
+                    ratio = np.log((1.0 - outlier) * np.exp(min(match, 8.0)) + outlier)
+                    ratio -= dead if ratio > 0 else -dead
+                    weight = np.sqrt(min(count[i, r, a], MOST_SURE) * min(count[j, r, b], MOST_SURE)) / MOST_SURE
+                    out[m, q + reach] += weight * ratio
+
+
+@no_type_check
+@njit(cache=True, nogil=True, fastmath=True)
+def said_by_shape(odd, sides, free, pairs, match, clash, reach, out):
+    """Adds to out (m, 2 reach + 1): what stands off the body meets what was seen there from the same side, or a place
+    that was seen to be empty."""
+    cells = odd.shape[2]
+    for m in range(pairs.shape[0]):
+        i, j = pairs[m, 0], pairs[m, 1]
+        for r in range(odd.shape[1]):
+            for a in range(cells):
+                mine, theirs = odd[i, r, a], odd[j, r, a]
+                if mine > 0.0:
+                    for q in range(-reach, reach + 1):
+                        b = (a - q) % cells
+                        if odd[j, r, b] > 0.0:
+                            for s in range(3):
+                                out[m, q + reach] += match * min(sides[i, s, r, a], sides[j, s, r, b])
+                        elif free[j, r, b] > 0.0:
+                            out[m, q + reach] -= clash * mine
+                if theirs > 0.0:
+                    for q in range(-reach, reach + 1):
+                        if free[i, r, (a + q) % cells] > 0.0:
+                            out[m, q + reach] -= clash * theirs
 
 
 @no_type_check
 @njit(cache=True, nogil=True)
-def turn_costs(poses, pairs, turns, maps, samples, odd, table, focal, center, step, depth_m, outline_m, looks, gains):
-    """(m, d): what speaks against turning view i of each pair (i, j) by turns[m, d] (4x4, object frame) against j."""
-    out = np.zeros((pairs.shape[0], turns.shape[1]))
-    sums = np.zeros(4)
+def differences(looks, count, pairs, state, every, width, out):
+    """Histogram (2, bins) of the differences of looks between a pair's cells at the turn in `state`, or at every so
+    many turns where `every` is not 0."""
+    cells, bins = looks.shape[2], out.shape[1]
     for m in range(pairs.shape[0]):
         i, j = pairs[m, 0], pairs[m, 1]
-        mine = samples[table[i, FIRST] : table[i, FIRST] + table[i, COUNT]]
-        theirs = samples[table[j, FIRST] : table[j, FIRST] + table[j, COUNT]]
-        first_i, first_j = table[i, FIRST], table[j, FIRST]
-        all_of_them = float(mine.shape[0] // step + theirs.shape[0] // step)
-        back = k.inverse(poses[j])
-        for d in range(turns.shape[1]):
-            sums[:] = 0.0
-            pose = poses[i] @ turns[m, d]
-            other = poses[j] @ k.inverse(pose)
-            contradictions(
-                mine, odd[first_i:], step, other, maps, table[j], focal, center, depth_m, outline_m, looks, sums
-            )
-            contradictions(
-                theirs, odd[first_j:], step, pose @ back, maps, table[i], focal, center, depth_m, outline_m, looks, sums
-            )
-            out[m, d] = sums[0] / all_of_them + gains[m] * sums[2] / max(sums[3], LEAST_LOOKS)
-    return out
+        here = (state[i] - state[j]) % cells
+        for q in range(cells):
+            if (every == 0 and q != here) or (every > 0 and q % every != 0):
+                continue
+            for r in range(looks.shape[1]):
+                for a in range(cells):
+                    b = (a - q) % cells
+                    if count[i, r, a] < 2 or count[j, r, b] < 2:
+                        continue
+                    for c in range(2):
+                        at = int(abs(looks[i, r, a, c] - looks[j, r, b, c]) / width)
+                        out[c, min(at, bins - 1)] += 1
+
+
+@no_type_check
+@njit(cache=True, nogil=True, fastmath=True)
+def spin_cost(state, base, steps_s, still, price, step, motion):
+    """Price of the changes of spin. base (v-1): turn about the axis from view to view at state 0 (rad); still (v):
+    whether a view stands for frames without motion; price (v); motion: usual change, fast spin, price of faster."""
+    usual, fast, dear = motion[0], motion[1], motion[2]
+    total, last, known = 0.0, 0.0, False
+    n = len(steps_s)
+    for t in range(n + 1):
+        if still[t]:
+            if known:
+                total += price[t] * np.log(1.0 + (last / usual) ** 2)
+            last, known = 0.0, True
+        if t == n:
+            break
+        turn = base[t] - (state[t + 1] - state[t]) * step
+        turn -= 2.0 * np.pi * np.floor(turn / (2.0 * np.pi) + 0.5)
+        rate = turn / steps_s[t]
+        if known:
+            total += price[t] * np.log(1.0 + ((rate - last) / usual) ** 2)
+        total += dear * max(abs(rate) / fast - 1.0, 0.0)
+        last, known = rate, True
+    return total
+
+
+@no_type_check
+@njit(cache=True, nogil=True, fastmath=True)
+def energy(state, costs, pairs, base, steps_s, still, price, step, motion):
+    """What the pairs (costs (m, cells), cyclic) and the changes of spin cost together."""
+    total = spin_cost(state, base, steps_s, still, price, step, motion)
+    for m in range(pairs.shape[0]):
+        total += costs[m, (state[pairs[m, 0]] - state[pairs[m, 1]]) % costs.shape[1]]
+    return total
+
+
+@no_type_check
+@njit(cache=True, nogil=True, fastmath=True)
+def _part(state, a, b, costs, pairs, out):
+    """Into out (cells): what the pairs with one view in a..b cost when those views turn together."""
+    cells = costs.shape[1]
+    out[:] = 0.0
+    for m in range(pairs.shape[0]):
+        i, j = pairs[m, 0], pairs[m, 1]
+        one, two = a <= i <= b, a <= j <= b
+        if one == two:
+            continue
+        between = (state[i] - state[j]) % cells
+        for q in range(cells):
+            out[q] += costs[m, (between + q if one else between - q) % cells]
+
+
+@no_type_check
+@njit(cache=True, nogil=True, fastmath=True)
+def _ramp(state, a, length, q, cells, trial):
+    """`trial`: the views from a on turned, over `length` of them more and more, by q."""
+    turn = q if q <= cells // 2 else q - cells
+    for t in range(len(state)):
+        share = min(max((t - a + 1.0) / length, 0.0), 1.0)
+        trial[t] = (state[t] + int(np.round(turn * share))) % cells
+
+
+@no_type_check
+@njit(cache=True, nogil=True, fastmath=True)
+def settle(state, costs, pairs, base, steps_s, still, price, step, motion, sweeps, longest):
+    """Turns runs of views, ends of the toss, and ends reached by a ramp, until none wants to turn; view 0 stays."""
+    v, cells = len(state), costs.shape[1]
+    out, trial = np.zeros(cells), state.copy()
+    for _ in range(sweeps):
+        changed = False
+        for length in range(longest):
+            for a in range(1, v):
+                b = v - 1 if length == 0 else a + length - 1
+                if b >= v or (length > 0 and b == v - 1) or (length > 4 and length % 4 > 0):
+                    continue
+                _part(state, a, b, costs, pairs, out)
+                best, least = 0, 0.0
+                for q in range(cells):
+                    trial[:] = state
+                    trial[a : b + 1] = (state[a : b + 1] + q) % cells
+                    e = out[q] + spin_cost(trial, base, steps_s, still, price, step, motion)
+                    if q == 0 or e < least - 1e-9:
+                        best, least = q, e
+                if best:
+                    state[a : b + 1] = (state[a : b + 1] + best) % cells
+                    changed = True
+        for length in RAMPS:
+            for a in range(1, v - 1):
+                best, least = 0, 0.0
+                for q in range(cells):
+                    _ramp(state, a, length, q, cells, trial)
+                    e = energy(trial, costs, pairs, base, steps_s, still, price, step, motion)
+                    if q == 0 or e < least - 1e-6:
+                        best, least = q, e
+                if best:
+                    _ramp(state, a, length, best, cells, trial)
+                    state[:] = trial
+                    changed = True
+        if not changed:
+            break
+    return state
+
+
+@no_type_check
+@njit(cache=True, nogil=True, fastmath=True)
+def greedy(v, costs, pairs, base, steps_s, still, price, step, motion):
+    """Each view where those before want it."""
+    cells = costs.shape[1]
+    state, e = np.zeros(v, np.int64), np.zeros(cells)
+    for t in range(1, v):
+        e[:] = 0.0
+        for m in range(pairs.shape[0]):
+            i, j = pairs[m, 0], pairs[m, 1]
+            if i == t and j < t:
+                for q in range(cells):
+                    e[q] += costs[m, (q - state[j]) % cells]
+        best = 0
+        for q in range(cells):
+            state[t] = q
+            e[q] += spin_cost(state[: t + 1], base[:t], steps_s[:t], still[: t + 1], price[: t + 1], step, motion)
+            if e[q] < e[best]:
+                best = q
+        state[t] = best
+    return state
+
+
+@no_type_check
+@njit(cache=True, nogil=True, fastmath=True)
+def spreads(state, costs, pairs, base, steps_s, still, price, step, motion):
+    """Variance (rad^2) of each view's turn against view 0: the widest of the moves that turn it, each with the
+    probability that its energy leaves it."""
+    v, cells = len(state), costs.shape[1]
+    out, trial, e, var = np.zeros(cells), state.copy(), np.zeros(cells), np.zeros(v)
+    for length in range(v):
+        for a in range(1, v):
+            b = v - 1 if length == 0 else a + length - 1
+            if b >= v:
+                continue
+            _part(state, a, b, costs, pairs, out)
+            for q in range(cells):
+                trial[:] = state
+                trial[a : b + 1] = (state[a : b + 1] + q) % cells
+                e[q] = out[q] + spin_cost(trial, base, steps_s, still, price, step, motion)
+            _widen(var, e, a, b, 1, step)
+    for length in RAMPS:
+        for a in range(1, v - 1):
+            for q in range(cells):
+                _ramp(state, a, length, q, cells, trial)
+                e[q] = energy(trial, costs, pairs, base, steps_s, still, price, step, motion)
+            _widen(var, e, a, v - 1, length, step)
+    return var
+
+
+@no_type_check
+@njit(cache=True, nogil=True, fastmath=True)
+def _widen(var, e, a, b, length, step):
+    cells = len(e)
+    least, total, square = e.min(), 0.0, 0.0
+    for q in range(cells):
+        share = np.exp(least - e[q])
+        turn = ((q + cells // 2) % cells - cells // 2) * step
+        total += share
+        square += share * turn * turn
+    for t in range(a, b + 1):
+        part = min((t - a + 1.0) / length, 1.0)
+        var[t] = max(var[t], square / total * part * part)

@@ -1,23 +1,27 @@
 """A round body's turn about its axis: sought over all turns and all frames at once, because no single frame tells it.
 
-Where the depth of all frames leaves one turn open (a mug's, a can's), every pair of views is compared over that whole
-turn; the turns of all frames together are then those that contradict the pairs least and spin steadily. What even that
-leaves open is told as a standard deviation per frame.
+Where the depth of all frames leaves one turn open (a mug's, a can's), the views are laid out about the axis (charts.py)
+and every pair is compared over that whole turn: does what stands off the body fall into a place that was seen empty, do
+looks that are rare at their height meet. Evidence is a log likelihood ratio against a random turn, so that a body of
+one colour says nothing and a small label much. The turns of all frames are those that cost least together with the
+changes of spin: first on a grid (turn_kernels.py), then off it, where steady spin tells what the images leave open
+(steady_turns.py). What even that leaves open is told as a standard deviation per frame.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
+import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray as Array
 
-from processing.track import kernels as k
 from processing.track import turn_kernels as tk
 from processing.track.beam import Scene
-from processing.track.keyframes import view_directions
+from processing.track.charts import ChartConfig, Charts, charts_of
 from processing.track.round_axis import Axis, AxisConfig
+from processing.track.steady_turns import Pace, SteadyConfig, steadied
 from recordings.geometry import rotation_log
 
 
@@ -26,49 +30,51 @@ class TurnConfig:
     """How a round body's turns are sought."""
 
     axis: AxisConfig = field(default_factory=AxisConfig)
-    grid_deg: float = 5.0
-    fine_deg: float = 1.5
-    """Steps of the two searches ..."""
-    fine_reach_deg: float = 12.0
-    """... and how far the second one goes."""
-    polar_deg: float = 40.0
-    """Views are compared whose directions differ by at most this in their angle to the axis."""
-    near: tuple[int, ...] = (1, 2, 4)
+    chart: ChartConfig = field(default_factory=ChartConfig)
+    steady: SteadyConfig = field(default_factory=SteadyConfig)
+    cells: int = 120
+    fine_cells: int = 240
+    fine_reach: int = 20
+    """Cells of the circle on the grid and off it, and how many of the latter a pair is compared over."""
+    near: tuple[int, ...] = (1, 2, 3, 4, 6)
     """Steps in time over which views are always compared ..."""
-    pairs: int = 8
-    """... and how many others a view is compared with."""
-    every: int = 2
-    """Of a view's points, one in so many is used."""
-    depth_m: float = 0.004
-    outline_m: float = 0.004
-    bright: float = 0.3
-    color: float = 0.15
-    """Scales: depth and outline (at 0.8 m), differences of looks."""
-    looks_gain: float = 0.5
-    """Of looks beside outright contradictions ..."""
-    far_gain: float = 0.15
-    """... and between views farther apart in time, because shading makes them err more."""
-    most: float = 0.06
+    pairs: int = 12
+    """... and how many others a view is compared with, spread over time."""
+    least_sigma: float = 0.05
+    wider: float = 1.3
+    """Colours match within this, or this often the usual difference of views far apart in time ..."""
+    far_steps: int = 5
+    outlier: float = 0.1
+    """... but for so many."""
+    dead: float = 0.5
+    """A cell's log ratio below this is chance ..."""
+    looks_gain: float = 0.125
+    shape_gain: float = 0.25
+    """... and neighbouring cells err together: so much of their sum counts."""
+    match: float = 2.0
+    clash: float = 2.0
+    """Log ratio of a cell where something stands off the body in both views, or in one where the other saw nothing."""
+    pair_dead: float = 2.0
+    fine_dead: float = 0.5
+    """A pair's looks below this are the light's."""
+    most: float = 6.0
     """A pair's word counts no more than this."""
-    spin_change_rad_s: float = 3.0
-    spin_price: float = 0.02
-    """Change of spin about the axis that costs half the price: a round body's is constant in flight."""
+    spin_change_rad_s: float = 1.5
+    """Usual change of spin from view to view, on the grid."""
+    flight_price: float = 4.0
+    """Of a change of spin in free flight, beside one elsewhere."""
+    flight_m_s: float = 0.15
+    """A change of velocity, beyond gravity's, below this is free flight."""
     fast_rad_s: float = 25.0
-    fast_price: float = 0.5
+    fast_price: float = 20.0
     """Spins above this cost their excess times this."""
-    profile_m: float = 0.01
-    profile_share: float = 0.85
-    off_m: float = 0.006
-    """Points farther from the axis by this than that share of those at the same height (cells of `profile_m`) are odd:
-    a handle's."""
-    temperature: float = 0.03
-    """Sum of contradictions that is chance."""
-    sweeps: int = 12
-    least_odd: int = 4
-    """Points off the round body that show a handle."""
+    sweeps: int = 8
+    longest: int = 12
+    """Views of a run that is turned together."""
+    rounds: int = 2
     least_sigma_deg: float = 3.0
     """What shading and the depth sensor's fixed pattern make a found turn err by, however sure the pairs are."""
-    usual: float = 0.005
+    usual: float = 0.5
     """Contradiction that right poses leave; where more is left, something is wrong and doubt grows with it."""
 
 
@@ -79,8 +85,15 @@ class Turned:
     poses: Float[Array, "n 4 4"]
     sigma_rad: Float[Array, " n"]
     axis: Axis
-    shown: float = 0.0
-    """Share of the views that show something off the round body (a handle): they tell the turn by themselves."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Frames:
+    """Runs of used frames (those between which the object stands still together), a view for each, compared pairs."""
+
+    runs: list[list[int]]
+    views: Int[Array, " v"]
+    pairs: Int[Array, "m 2"]
 
 
 def doubted(found: Turned, said: float, first: int, config: TurnConfig) -> Turned:
@@ -95,10 +108,11 @@ def contradiction(
     scene: Scene, poses: Float[Array, "n 4 4"], use: Bool[Array, " n"], axis: Axis, config: TurnConfig
 ) -> float:
     """What the pairs of views that the search compares say against these poses, mean over pairs."""
-    views = np.array([run[len(run) // 2] for run in _runs(scene, use)])
-    pairs = _pairs(poses, views, axis, config)
-    odd = _odd(scene, poses, use, axis, config)
-    return float(_raw(scene, poses, views, pairs, np.zeros(1), np.zeros(len(pairs)), odd, axis, config).mean())
+    frames = _frames(scene, use, config)
+    if len(frames.pairs) == 0:
+        return 0.0
+    costs, _ = _fine_costs(scene, poses, frames, axis, config)
+    return float(costs[:, config.fine_reach].mean())
 
 
 def turned(
@@ -107,136 +121,164 @@ def turned(
 ) -> Turned:  # fmt: skip
     """The poses with the turns about `axis` that all frames together say; `rivals` are other stories to start from.
     The first frame's pose stays."""
-    runs = _runs(scene, use)
-    views = np.array([run[len(run) // 2] for run in runs])
-    pairs = _pairs(poses, views, axis, config)
-    if len(pairs) == 0:
+    frames = _frames(scene, use, config)
+    if len(frames.pairs) == 0:
         return Turned(poses, np.zeros(len(poses)), axis)
-    # what stands still turns between its last frame and the next one's first
-    steps_s = np.array([scene.times_s[b[0]] - scene.times_s[a[-1]] for a, b in zip(runs, runs[1:])])
-    base = _rates(poses, views, steps_s, axis)
-    odd = _odd(scene, poses, use, axis, config)
-    step = np.radians(config.grid_deg)
-    count = round(2 * np.pi / step)
-    wide = _costs(scene, poses, views, pairs, np.arange(count) * step, np.zeros(len(pairs)), odd, axis, config)
-    wide = 0.25 * np.roll(wide, 1, 1) + 0.5 * wide + 0.25 * np.roll(wide, -1, 1)
-    field = _Field(wide, pairs, base, steps_s, step, True, config)
-    starts = [np.zeros(len(views), dtype=np.int64), field.greedy(len(views))]
-    starts += [np.round(_angles(poses[views], r[views], axis) / step).astype(np.int64) for r in rivals]
-    state = min((field.settled(s) for s in starts), key=field.energy)
-    sigma = field.sigma(state)
-    angle = state * step
-    fine = np.radians(config.fine_deg)
-    reach = round(config.fine_reach_deg / config.fine_deg)
-    offsets = np.arange(-reach, reach + 1) * fine
-    between = angle[pairs[:, 0]] - angle[pairs[:, 1]]
-    close = _costs(scene, poses, views, pairs, offsets, between, odd, axis, config)
-    base = base - np.diff(np.unwrap(angle)) / steps_s
-    last = _Field(close, pairs, base, steps_s, fine, False, config)
-    angle = angle + last.settled(np.zeros(len(views), dtype=np.int64)) * fine
-    angle = angle - angle[_run_of(runs, first)]
-    out, spread = poses.copy(), np.zeros(len(poses))
-    for run, a, s in zip(runs, angle, sigma):
+    step = 2 * np.pi / config.cells
+    charts = charts_of(scene, poses, frames.views, axis, config.cells, config.chart)
+    pace = _pace(scene, poses, frames, axis, config)
+    looks, shape = _said(charts, frames.pairs, config.cells // 2, None, config)
+    looks = np.maximum(_above_least(looks) - config.pair_dead, 0.0)
+    costs = _cyclic(looks - shape, config.cells)
+    # a cell more or less: turns are rounded to the grid
+    costs = np.minimum(np.minimum(np.roll(costs, 1, 1), costs), np.roll(costs, -1, 1))
+    costs = np.minimum(_above_least(costs), config.most)
+    motion = np.array([config.spin_change_rad_s, config.fast_rad_s, config.fast_price])
+    given = (costs, frames.pairs, pace.base_rad, pace.steps_s, pace.still, pace.price, step, motion)
+    starts = [np.zeros(len(frames.views), dtype=np.int64), tk.greedy(len(frames.views), *given)]
+    starts += [np.round(_angles(poses[frames.views], r[frames.views], axis) / step).astype(np.int64) % config.cells
+               for r in rivals]  # fmt: skip
+    found = [tk.settle(s, *given, config.sweeps, config.longest) for s in starts]
+    state = min(found, key=lambda s: float(tk.energy(s, *given)))
+    sigma = np.sqrt(tk.spreads(state, *given))
+    out = _moved(poses, frames, state * step, axis, first)
+    spread = np.zeros(len(poses))
+    for run, s in zip(frames.runs, sigma):
+        spread[run] = s
+    return steady(scene, Turned(out, spread, axis), use, first, config)
+
+
+def steady(scene: Scene, found: Turned, use: Bool[Array, " n"], first: int, config: TurnConfig) -> Turned:
+    """The turns off the grid, near those that were found; what the motion leaves open is added to the doubt."""
+    frames = _frames(scene, use, config)
+    poses, spread = found.poses, np.zeros(len(found.poses))
+    if len(frames.pairs) == 0:
+        return found
+    for _ in range(config.rounds):
+        costs, cell_rad = _fine_costs(scene, poses, frames, found.axis, config)
+        pace = _pace(scene, poses, frames, found.axis, config)
+        start = _run_of(frames.runs, first)
+        angle, sigma = steadied(costs, frames.pairs, pace, cell_rad, start, config.steady)
+        poses = _moved(poses, frames, angle, found.axis, first)
+        for run, s in zip(frames.runs, sigma):
+            spread[run] = s
+    return replace(found, poses=poses, sigma_rad=np.sqrt(found.sigma_rad**2 + spread**2))
+
+
+def _moved(
+    poses: Float[Array, "n 4 4"], frames: _Frames, angle: Float[Array, " v"], axis: Axis, first: int
+) -> Float[Array, "n 4 4"]:
+    """The poses turned by their views' angles, less that of the first frame."""
+    out = poses.copy()
+    for run, a in zip(frames.runs, angle - angle[_run_of(frames.runs, first)]):
         turn = axis.turn(float(a))
         for i in run:
-            out[i], spread[i] = poses[i] @ turn, s
-    shown = np.mean(
-        [odd[f : f + c].sum() >= config.least_odd for f, c in scene.store.table[views][:, [k.FIRST, k.COUNT]]]
-    )
-    return Turned(out, spread, axis, float(shown))
-
-
-def _odd(
-    scene: Scene, poses: Float[Array, "n 4 4"], use: Bool[Array, " n"], axis: Axis, config: TurnConfig
-) -> Float[Array, " s"]:
-    """Which of the store's samples lie outside the round body (1), as a handle does."""
-    store = scene.store
-    out = np.zeros(len(store.samples))
-    where, height, radius = [], [], []
-    for i in np.flatnonzero(use):
-        first, count = int(store.table[i, k.FIRST]), int(store.table[i, k.COUNT])
-        p = (store.samples[first : first + count, :3] - poses[i][:3, 3]) @ poses[i][:3, :3] - axis.point_m
-        along = p @ axis.direction
-        where.append(np.arange(first, first + count))
-        height.append(along)
-        radius.append(np.linalg.norm(p - along[:, None] * axis.direction, axis=1))
-    index, h, r = np.concatenate(where), np.concatenate(height), np.concatenate(radius)
-    cell = np.floor((h - h.min()) / config.profile_m).astype(int)
-    for c in np.unique(cell):
-        here = cell == c
-        most = np.quantile(r[here], config.profile_share)
-        out[index[here & (r > most + config.off_m)]] = 1.0
+            out[i] = poses[i] @ turn
     return out
 
 
-def _runs(scene: Scene, use: Bool[Array, " n"]) -> list[list[int]]:
-    """Used frames, those between which the object stands still together."""
+def _fine_costs(
+    scene: Scene, poses: Float[Array, "n 4 4"], frames: _Frames, axis: Axis, config: TurnConfig
+) -> tuple[Float[Array, "m d"], float]:
+    """What each pair says against turns near those of the poses, in fine cells, and a cell's angle."""
+    charts = charts_of(scene, poses, frames.views, axis, config.fine_cells, config.chart)
+    here = np.zeros(len(frames.views), dtype=np.int64)
+    share = config.cells / config.fine_cells  # more cells, as many witnesses
+    looks, shape = _said(charts, frames.pairs, config.fine_reach, here, config)
+    looks, shape = _above_least(share * looks), _above_least(-share * shape)
+    costs = np.minimum(np.maximum(looks - config.fine_dead, 0.0) + shape, config.most)
+    return costs, 2 * np.pi / config.fine_cells
+
+
+def _said(
+    charts: Charts, pairs: Int[Array, "m 2"], reach: int, state: Int[Array, " v"] | None, config: TurnConfig
+) -> tuple[Float[Array, "m d"], Float[Array, "m d"]]:
+    """Costs by looks, and evidence by shape, of each pair's turns by -reach..reach cells."""
+    looks, shape = np.zeros((len(pairs), 2 * reach + 1)), np.zeros((len(pairs), 2 * reach + 1))
+    sigma = np.maximum(config.wider * _differences(charts, pairs, state, config), config.least_sigma)
+    usual = _usual(charts, sigma)
+    tk.said_by_looks(charts.looks, charts.count, usual, pairs, sigma, config.outlier, config.dead, reach, looks)
+    tk.said_by_shape(charts.odd, charts.sides, charts.free, pairs, config.match, config.clash, reach, shape)
+    return -config.looks_gain * looks, config.shape_gain * shape
+
+
+def _above_least(costs: Float[Array, "m d"]) -> Float[Array, "m d"]:
+    return costs - costs.min(1, keepdims=True)
+
+
+def _cyclic(costs: Float[Array, "m d"], cells: int) -> Float[Array, "m c"]:
+    """From turns by -cells/2..cells/2 to turns by 0..cells-1."""
+    return np.roll(costs[:, : costs.shape[1] - 1], -(cells // 2), axis=1)
+
+
+def _differences(
+    charts: Charts, pairs: Int[Array, "m 2"], state: Int[Array, " v"] | None, config: TurnConfig
+) -> Float[Array, "2"]:
+    """Standard deviation (from the median) of a cell's looks between views far apart in time: in `state`, or (None)
+    over all turns."""
+    far = pairs[np.abs(pairs[:, 0] - pairs[:, 1]) >= config.far_steps]
+    far = far if len(far) >= 10 else pairs
+    width, counts = 0.001, np.zeros((2, 2000))
+    turns = np.zeros(len(charts.looks), dtype=np.int64) if state is None else state
+    tk.differences(charts.looks, charts.count, far, turns, 10 if state is None else 0, width, counts)
+    middle = [width * (np.searchsorted(np.cumsum(c), c.sum() / 2) + 0.5) for c in counts]
+    return np.asarray(1.48 / np.sqrt(2) * np.array(middle))
+
+
+def _usual(charts: Charts, sigma: Float[Array, "2"]) -> Float[Array, "v r c"]:
+    """Log density of each cell's looks among all that its row shows: a turn only shuffles a row."""
+    out = np.zeros(charts.count.shape)
+    for r in range(charts.count.shape[1]):
+        use = charts.count[:, r] > 0
+        if use.sum() < 5:
+            continue
+        seen = charts.looks[:, r][use]
+        at = np.clip(np.round((seen - np.median(seen, axis=0)) / sigma) + 30, 0, 60).astype(int)
+        shares = np.zeros((61, 61))
+        np.add.at(shares, (at[:, 0], at[:, 1]), 1.0 / len(at))
+        dense = 0.97 * cv2.GaussianBlur(shares, (0, 0), float(np.sqrt(2.0))) + 0.03 / shares.size
+        out[:, r][use] = np.log(dense[at[:, 0], at[:, 1]] / (sigma[0] * sigma[1]))
+    return out
+
+
+def _frames(scene: Scene, use: Bool[Array, " n"], config: TurnConfig) -> _Frames:
     runs: list[list[int]] = []
     for i in np.flatnonzero(use):
         if runs and runs[-1][-1] == i - 1 and scene.store.stands_still(int(i) - 1, int(i)):
             runs[-1].append(int(i))
         else:
             runs.append([int(i)])
-    return runs
+    views = np.array([run[len(run) // 2] for run in runs], dtype=np.int64)
+    chosen = set()
+    for a in range(len(runs)):
+        chosen |= {(a, a - s) for s in config.near if s <= a}
+        earlier = [b for b in range(a) if (a, b) not in chosen]
+        if earlier:
+            spread = np.unique(np.linspace(0, len(earlier) - 1, config.pairs).round().astype(int))
+            chosen |= {(a, earlier[p]) for p in spread}
+    return _Frames(runs, views, np.array(sorted(chosen), dtype=np.int64).reshape(-1, 2))
 
 
 def _run_of(runs: list[list[int]], frame: int) -> int:
     return next((n for n, run in enumerate(runs) if frame in run), 0)
 
 
-def _pairs(
-    poses: Float[Array, "n 4 4"], views: Int[Array, " v"], axis: Axis, config: TurnConfig
-) -> Int[Array, "m 2"]:  # fmt: skip
-    """Positions in `views`, later one first: neighbours in time, and views from about the same angle to the axis."""
-    toward = view_directions(poses[views], axis.point_m)
-    polar = np.degrees(np.arccos(np.clip(toward @ axis.direction, -1, 1)))
-    chosen = set()
-    for a in range(len(views)):
-        apart = np.abs(polar - polar[a])
-        chosen |= {(a, a - s) for s in config.near if s <= a and apart[a - s] < config.polar_deg}
-        earlier = [b for b in range(a) if apart[b] < config.polar_deg and (a, b) not in chosen]
-        # spread over time, so that the first frames are linked with the last
-        picked: Array | list[int] = (
-            np.unique(np.linspace(0, len(earlier) - 1, config.pairs).round().astype(int)) if earlier else []
-        )
-        chosen |= {(a, earlier[p]) for p in picked}
-    return np.array(sorted(chosen), dtype=np.int64).reshape(-1, 2)
-
-
-def _costs(
-    scene: Scene, poses: Float[Array, "n 4 4"], views: Int[Array, " v"], pairs: Int[Array, "m 2"],
-    offsets_rad: Float[Array, " d"], between_rad: Float[Array, " m"], odd: Float[Array, " s"], axis: Axis,
-    config: TurnConfig,
-) -> Float[Array, "m d"]:  # fmt: skip
-    """As `_raw`, above each pair's least, and no more than a pair may say."""
-    costs = _raw(scene, poses, views, pairs, offsets_rad, between_rad, odd, axis, config)
-    return np.minimum(costs - costs.min(1, keepdims=True), config.most)
-
-
-def _raw(
-    scene: Scene, poses: Float[Array, "n 4 4"], views: Int[Array, " v"], pairs: Int[Array, "m 2"],
-    offsets_rad: Float[Array, " d"], between_rad: Float[Array, " m"], odd: Float[Array, " s"], axis: Axis,
-    config: TurnConfig,
-) -> Float[Array, "m d"]:  # fmt: skip
-    """What speaks against each turn of a pair's first view against its second."""
-    turns = np.array([[axis.turn(float(b + o)) for o in offsets_rad] for b in np.unique(between_rad)])
-    turns = turns[np.searchsorted(np.unique(between_rad), between_rad)]
-    store = scene.store
-    far = float(np.median(np.linalg.norm(store.center_m[views], axis=1))) / 0.8
-    return np.asarray(tk.turn_costs(
-        np.ascontiguousarray(poses), views[pairs], turns, store.maps, store.samples, odd, store.table,
-        store.optics.focal, store.optics.center, config.every, config.depth_m * float(np.clip(far**2, 0.5, 4.0)),
-        config.outline_m * float(np.clip(far, 0.5, 2.0)), np.array([config.bright, config.color]),
-        np.where(pairs[:, 0] - pairs[:, 1] <= 2, config.looks_gain, config.far_gain),
-    ))  # fmt: skip
-
-
-def _rates(
-    poses: Float[Array, "n 4 4"], views: Int[Array, " v"], steps_s: Float[Array, " r"], axis: Axis
-) -> Float[Array, " r"]:
-    """Spin about the axis from view to view, rad/s, object frame."""
-    turns = [rotation_log(poses[b][:3, :3].T @ poses[a][:3, :3]) for a, b in zip(views, views[1:])]
-    return np.array([float(t @ axis.direction) for t in turns]) / steps_s
+def _pace(scene: Scene, poses: Float[Array, "n 4 4"], frames: _Frames, axis: Axis, config: TurnConfig) -> Pace:
+    """How the body turns about its axis from view to view, and where it flies freely."""
+    runs, views, t = frames.runs, frames.views, scene.times_s
+    # what stands still turns between its last frame and the next one's first
+    steps_s = np.array([t[b[0]] - t[a[-1]] for a, b in zip(runs, runs[1:])])
+    base = np.array([float(rotation_log(poses[b][:3, :3].T @ poses[a][:3, :3]) @ axis.direction)
+                     for a, b in zip(views, views[1:])])  # fmt: skip
+    still = np.array([len(run) > 1 for run in runs])
+    flies = np.zeros(len(runs), dtype=bool)
+    middle = axis.point_m + axis.direction * float(axis.direction @ scene.center_m)
+    for n in range(1, len(runs) - 1):
+        x = [poses[i][:3, :3] @ middle + poses[i][:3, 3] for i in views[n - 1 : n + 2]]
+        change = (x[2] - x[1]) / steps_s[n] - (x[1] - x[0]) / steps_s[n - 1]
+        change = change - 0.5 * (steps_s[n] + steps_s[n - 1]) * scene.gravity_camera_m_s2
+        flies[n] = not still[n] and np.linalg.norm(change) < config.flight_m_s
+    return Pace(base, steps_s, still, flies, np.where(flies, config.flight_price, 1.0))
 
 
 def _angles(poses: Float[Array, "v 4 4"], others: Float[Array, "v 4 4"], axis: Axis) -> Float[Array, " v"]:
@@ -249,86 +291,3 @@ def _angles(poses: Float[Array, "v 4 4"], others: Float[Array, "v 4 4"], axis: A
             sine = 0.5 * float(d @ [turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
             out[n] = np.arctan2(sine, 0.5 * (float(np.trace(turn)) - float(d @ turn @ d)))
     return out
-
-
-class _Field:
-    """Energy of all views' turns (whole steps): contradictions of the pairs and changes of spin; what lowers it."""
-
-    def __init__(
-        self, costs: Float[Array, "m d"], pairs: Int[Array, "m 2"], rates: Float[Array, " r"],
-        steps_s: Float[Array, " r"], step_rad: float, round_: bool, config: TurnConfig,
-    ) -> None:  # fmt: skip
-        self.costs, self.pairs, self.rates, self.steps_s = costs, pairs, rates, steps_s
-        self.step_rad, self.round, self.config = step_rad, round_, config
-        self.count = costs.shape[1]
-        reach = self.count // 2
-        self.moves = np.arange(self.count) if round_ else np.arange(-reach, reach + 1)
-
-    def _at(self, m: Int[Array, " a"], between: Int[Array, " a *b"]) -> Float[Array, " a *b"]:
-        rows_m = m.reshape(-1, *([1] * (between.ndim - 1)))
-        if self.round:
-            return np.asarray(self.costs[rows_m, between % self.count])
-        place = between + self.count // 2
-        ends = np.clip(place, 0, self.count - 1)
-        return np.asarray(self.costs[rows_m, ends] + 0.05 * np.abs(place - ends))
-
-    def _spin(self, states: Int[Array, "s v"]) -> Float[Array, " s"]:
-        """Price of the changes of spin."""
-        turn = np.diff(states, axis=1)
-        if self.round:
-            turn = (turn + self.count // 2) % self.count - self.count // 2
-        rate = self.rates + -turn * self.step_rad / self.steps_s
-        change = (np.diff(rate, axis=1) / self.config.spin_change_rad_s) ** 2
-        fast = np.maximum(np.abs(rate) / self.config.fast_rad_s - 1.0, 0.0)
-        return np.asarray(
-            self.config.spin_price * (change / (1.0 + change)).sum(1) + self.config.fast_price * fast.sum(1)
-        )
-
-    def energy(self, state: Int[Array, " v"]) -> float:
-        between = state[self.pairs[:, 0]] - state[self.pairs[:, 1]]
-        return float(self._at(np.arange(len(self.pairs)), between).sum() + self._spin(state[None])[0])
-
-    def moved(self, state: Int[Array, " v"], which: Bool[Array, " v"]) -> Float[Array, " d"]:
-        """Energy (but for a constant) when the views in `which` turn together by each move."""
-        one, two = which[self.pairs[:, 0]], which[self.pairs[:, 1]]
-        m = np.flatnonzero(one != two)
-        between = (state[self.pairs[:, 0]] - state[self.pairs[:, 1]])[m]
-        sign = np.where(one[m], 1, -1)
-        pair = self._at(m, between[:, None] + sign[:, None] * self.moves[None, :]).sum(0)
-        return np.asarray(pair + self._spin(state[None] + which[None] * self.moves[:, None]))
-
-    def settled(self, start: Int[Array, " v"]) -> Int[Array, " v"]:
-        """No view, and no end of the toss from any view on, wants to turn."""
-        state, v = start.copy(), len(start)
-        sets = [np.arange(v) >= t for t in range(1, v)] + [np.arange(v) == t for t in range(1, v)]
-        for _ in range(self.config.sweeps):
-            before = state.copy()
-            for which in sets:
-                state[which] += self.moves[int(self.moved(state, which).argmin())]
-            if (state == before).all():
-                break
-        return state
-
-    def greedy(self, v: int) -> Int[Array, " v"]:
-        """Each view where those before want it."""
-        state = np.zeros(v, dtype=np.int64)
-        for t in range(1, v):
-            m = np.flatnonzero((self.pairs[:, 0] == t) & (self.pairs[:, 1] < t))
-            told = self._at(m, self.moves[None, :] - state[self.pairs[m, 1]][:, None]).sum(0)
-            trial = np.repeat(state[None, : t + 1], self.count, 0)
-            trial[:, t] = self.moves
-            rates, steps = self.rates[:t], self.steps_s[:t]
-            part = _Field(self.costs, self.pairs, rates, steps, self.step_rad, self.round, self.config)
-            state[t] = self.moves[int((told + part._spin(trial)).argmin())]
-        return state
-
-    def sigma(self, state: Int[Array, " v"]) -> Float[Array, " v"]:
-        """Standard deviation of each view's turn against the first: the widest of those that lead to it."""
-        v = len(state)
-        turn = (self.moves + self.count // 2) % self.count - self.count // 2
-        out = np.zeros(v)
-        for t in range(1, v):
-            energy = self.moved(state, np.arange(v) >= t)
-            share = np.exp(-(energy - energy.min()) / self.config.temperature)
-            out[t] = np.sqrt(float(share @ (turn * self.step_rad) ** 2) / share.sum())
-        return np.asarray(np.maximum.accumulate(out))

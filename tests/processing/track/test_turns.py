@@ -6,10 +6,13 @@ import numpy as np
 import pytest
 
 from processing.track import kernels as k
+from processing.track import turn_kernels as tk
 from processing.track.beam import Scene
+from processing.track.charts import Charts
 from processing.track.features import Sift
 from processing.track.round_axis import Axis, AxisConfig, open_axis
-from processing.track.turns import TurnConfig, Turned, _Field, doubted
+from processing.track.steady_turns import Pace, SteadyConfig, steadied
+from processing.track.turns import TurnConfig, Turned, _usual, doubted
 from processing.track.views import Optics, ViewConfig, ViewStore
 from recordings.geometry import CameraModel, rotation_exp
 
@@ -74,24 +77,77 @@ def test_a_box_has_no_open_turn() -> None:
     assert open_axis(scene, poses, np.ones(len(poses), dtype=bool), AxisConfig()) is None
 
 
+def pace(views: int, flies: bool = False) -> Pace:
+    nothing = np.zeros(views - 1)
+    no = np.zeros(views, dtype=bool)
+    return Pace(nothing, np.full(views - 1, 1 / 30), no, no | flies, np.ones(views))
+
+
+def given(costs: np.ndarray, pairs: np.ndarray, views: int) -> tuple[object, ...]:
+    p = pace(views)
+    return (
+        costs, pairs, p.base_rad, p.steps_s, p.still, p.price, 2 * np.pi / costs.shape[1], np.array([1.5, 25.0, 20.0])
+    )  # fmt: skip
+
+
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_turns_that_pairs_of_views_agree_on_are_found_from_nothing(seed: int) -> None:
-    config, count, views = TurnConfig(), 72, 20
+    count, views = 72, 20
     rng = np.random.default_rng(seed)
     steady = 2 * np.arange(views) + rng.integers(-1, 2, views)
     steady[0] = 0
     pairs = np.array([(a, b) for a in range(views) for b in range(a) if a - b in (1, 2, 4, 7, 11)])
     gap = np.arange(count)[None] - (steady[pairs[:, 0]] - steady[pairs[:, 1]])[:, None]
     gap = np.abs((gap + count // 2) % count - count // 2)
-    costs = 0.03 * np.minimum(gap / 3.0, 1.0) + rng.normal(0, 0.002, gap.shape)
+    costs = 6 * np.minimum(gap / 3.0, 1.0) + rng.normal(0, 0.3, gap.shape)
     wild = rng.random(len(pairs)) < 0.15  # some pairs say something else altogether
     costs[wild] = np.roll(costs[wild], 20, axis=1)
-    field = _Field(costs, pairs, np.zeros(views - 1), np.full(views - 1, 1 / 30), np.radians(5.0), True, config)
-    state = min((field.settled(s) for s in (np.zeros(views, dtype=np.int64), field.greedy(views))), key=field.energy)
+    problem = given(costs, pairs, views)
+    starts = np.zeros(views, dtype=np.int64), tk.greedy(views, *problem)
+    state = min((tk.settle(s, *problem, 8, 12) for s in starts), key=lambda s: float(tk.energy(s, *problem)))
     state = state - state[0]
     assert np.abs((state - steady + count // 2) % count - count // 2).max() <= 1
-    blind = _Field(np.zeros_like(costs), pairs, np.zeros(views - 1), np.full(views - 1, 1 / 30), 0.087, True, config)
-    assert field.sigma(state).max() < blind.sigma(state).max()
+    blind = given(np.zeros_like(costs), pairs, views)
+    assert tk.spreads(state, *problem).max() < 0.1 * tk.spreads(state, *blind).max()
+
+
+def test_a_stretch_that_shows_nothing_turns_as_steadily_as_what_is_seen_around_it() -> None:
+    views, reach, cell = 30, 40, np.radians(1.5)
+    truth = 0.04 * np.arange(views)  # 1.2 rad/s; the angles start elsewhere
+    seen = (np.arange(views) < 8) | (np.arange(views) >= 22)
+    pairs = np.array([(a, b) for a in range(views) for b in range(a) if seen[a] and seen[b]])
+    offsets = np.arange(-reach, reach + 1)[None] * cell - (truth[pairs[:, 0]] - truth[pairs[:, 1]])[:, None]
+    costs = np.minimum(np.abs(offsets) / cell, 6.0)
+    start = np.where(seen, 0.0, 0.3)
+    p = pace(views, flies=True)
+    moved = Pace(-np.diff(start), p.steps_s, p.still, p.flies, p.price)
+    shift = start[pairs[:, 0]] - start[pairs[:, 1]]
+    assert (shift == 0).all()
+    angle, sigma = steadied(costs, pairs, moved, cell, 0, SteadyConfig())
+    np.testing.assert_allclose(start + angle, truth, atol=np.radians(1.5))
+    assert sigma[0] == 0
+    assert sigma[15] > 2 * sigma[5]
+
+
+def test_looks_of_one_colour_say_nothing_and_a_label_says_where_it_is() -> None:
+    rng = np.random.default_rng(0)
+    looks = rng.normal(0, 0.02, (2, 4, 60, 2))
+    count = np.ones((2, 4, 60))
+    count[:, :, 40:] = 0
+    pairs, out = np.array([[0, 1]]), np.zeros((1, 61))
+    sigma = np.full(2, 0.05)
+
+    def said() -> np.ndarray:
+        charts = Charts(looks, count, np.zeros((2, 1, 60)), np.zeros((2, 3, 1, 60)), np.zeros((2, 1, 60)))
+        out[:] = 0
+        tk.said_by_looks(looks, count, _usual(charts, sigma), pairs, sigma, 0.1, 0.5, 30, out)
+        return out[0]
+
+    assert np.ptp(said()) < 1.0
+    looks[0, 1:3, 20:26] += 0.6
+    looks[1, 1:3, 12:18] += 0.6
+    assert int(said().argmax()) - 30 == 8
+    assert said().max() > said()[30] + 10
 
 
 def test_what_contradicts_the_poses_widens_the_doubt() -> None:

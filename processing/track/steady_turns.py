@@ -1,0 +1,113 @@
+"""The turns of all views at once, off the grid: where the images leave a turn open, the motion tells it.
+
+A round body's spin about its axis is constant in free flight (Euler's equations with two equal moments of inertia), so
+that what is seen before and after a stretch in which nothing tells the turn fixes that stretch too.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from numpy import ndarray as Array
+
+STARTING = 0.6
+"""A start from rest changes the spin over its first step by half of what the same acceleration does later."""
+Terms = list[tuple[int, float, Float[Array, " v"]]]
+"""View, change of spin there (rad/s), its derivative by all views' turns."""
+
+
+@dataclass(frozen=True)
+class SteadyConfig:
+    """How much the spin about the axis changes from view to view (rad/s)."""
+
+    flight_rad_s: float = 0.3
+    other_rad_s: float = 1.5
+    """In a hand, on the table; impacts are outliers (Cauchy)."""
+    steps: int = 40
+    most: float = 4.0
+    """Cells that a view turns by in one step."""
+
+
+@dataclass(frozen=True, eq=False)
+class Pace:
+    """Between views: turn about the axis so far (v-1) and seconds; of views: whether it stands for frames without
+    motion, whether it flies, and the price of a change of spin there."""
+
+    base_rad: Float[Array, " r"]
+    steps_s: Float[Array, " r"]
+    still: Bool[Array, " v"]
+    flies: Bool[Array, " v"]
+    price: Float[Array, " v"]
+
+
+def steadied(
+    costs: Float[Array, "m d"], pairs: Int[Array, "m 2"], pace: Pace, cell_rad: float, first: int, config: SteadyConfig
+) -> tuple[Float[Array, " v"], Float[Array, " v"]]:
+    """Angles to add to each view's turn, and their standard deviations (rad); view `first` stays.
+
+    costs: of each pair by the difference of its views' angles, in cells around 0 (d odd). Gauss-Newton with each
+    curve's own slope and (if any) upward bend."""
+    reach = costs.shape[1] // 2
+    wide = np.pad(costs, ((0, 0), (2, 2)), mode="edge")
+    smooth = sum(w * wide[:, s : s + costs.shape[1]] for s, w in enumerate((0.1, 0.2, 0.4, 0.2, 0.1)))
+    angle = np.zeros(len(pace.still))
+    H = np.eye(len(angle))
+    for _ in range(config.steps):
+        H, g = _of_pairs(np.asarray(smooth), pairs, angle / cell_rad, reach, cell_rad)
+        for view, change, slope in _changes(angle, pace):
+            usual = config.flight_rad_s if pace.flies[view] else config.other_rad_s
+            usual *= STARTING if pace.still[view] else 1.0
+            weight = pace.price[view] / (1 + (change / (2 * usual)) ** 2) / usual**2
+            g += weight * change * slope
+            H += weight * np.outer(slope, slope)
+        g[first], H[first], H[:, first] = 0.0, 0.0, 0.0
+        H[first, first] = 1e9
+        step = -np.linalg.solve(H + 1e-7 * np.diag(np.diag(H)) + 1e-6 * np.eye(len(H)), g)
+        largest = float(np.abs(step).max())
+        angle = angle + step / max(largest / (config.most * cell_rad), 1.0)
+        if largest < 2e-3:
+            break
+    spread = np.sqrt(np.maximum(np.diag(np.linalg.inv(H + 1e-6 * np.eye(len(H)))), 0.0))
+    spread[first] = 0.0
+    return angle, np.asarray(spread)
+
+
+def _of_pairs(
+    costs: Float[Array, "m d"], pairs: Int[Array, "m 2"], cells: Float[Array, " v"], reach: int, cell_rad: float
+) -> tuple[Float[Array, "v v"], Float[Array, " v"]]:
+    """Normal equations of the pairs' costs at these angles (in cells)."""
+    i, j = pairs.T
+    between = cells[i] - cells[j]
+    at = np.clip(np.round(between).astype(int), 1 - reach, reach - 1) + reach
+    m = np.arange(len(pairs))
+    before, here, after = costs[m, at - 1], costs[m, at], costs[m, at + 1]
+    slope = 0.5 * (after - before)
+    bend = np.maximum(after - 2 * here + before, 0.0) + 0.02 * np.abs(slope)
+    pull = (slope + bend * np.clip(between - (at - reach), -1, 1)) / cell_rad
+    stiff = bend / cell_rad**2
+    H, g = np.zeros((len(cells), len(cells))), np.zeros(len(cells))
+    np.add.at(g, i, pull)
+    np.add.at(g, j, -pull)
+    for a, b, sign in ((i, i, 1), (j, j, 1), (i, j, -1), (j, i, -1)):
+        np.add.at(H, (a, b), sign * stiff)
+    return H, g
+
+
+def _changes(angle: Float[Array, " v"], pace: Pace) -> Terms:
+    """All changes of spin: between the steps before and after a view, and to and from standing still."""
+    rates = (pace.base_rad - np.diff(angle)) / pace.steps_s
+    v = len(angle)
+    slopes = np.zeros((v - 1, v))
+    slopes[np.arange(v - 1), np.arange(v - 1)] = 1 / pace.steps_s
+    slopes[np.arange(v - 1), np.arange(1, v)] = -1 / pace.steps_s
+    out: Terms = []
+    for t in range(v):
+        before = (float(rates[t - 1]), slopes[t - 1]) if t > 0 else None
+        after = (float(rates[t]), slopes[t]) if t < v - 1 else None
+        if pace.still[t]:
+            out += [(t, s[0], s[1]) for s in (before, after) if s is not None]
+        elif before is not None and after is not None:
+            out.append((t, after[0] - before[0], after[1] - before[1]))
+    return out
