@@ -5,11 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
 from processing.config import Config
-from processing.one_shape import _fused_stage, of_one_shape
+from processing.one_shape import _fused_stage, _left, of_one_shape
 from processing.pipeline import Run, start_run
 from processing.stage import Done
 from recordings.geometry import rotation_exp
@@ -19,10 +20,13 @@ from recordings.session import Session
 from recordings.tracks import ObjectTrack
 
 
-def stages(tiny_world: Any, run: Run, folder: Path, turned: int | None) -> tuple[Done, dict[int, Done]]:
-    """True poses as the stage of all tosses, one of them turned about the object's middle, and true masks."""
+def stages(
+    tiny_world: Any, run: Run, folder: Path, turned: int | None, narrower_px: int = 0
+) -> tuple[Done, dict[int, Done]]:
+    """True poses as the stage of all tosses, one of them turned about the object's middle, and true masks (or narrower
+    ones)."""
     tracks, masks = folder / "register-0", {}
-    tracks.mkdir()
+    tracks.mkdir(parents=True)
     for toss in run.tosses:
         times_ns = run.frames(toss).times_ns
         poses = [(tiny_world.world_from_camera.inverse() @ p).matrix for p in tiny_world.poses(len(times_ns), toss)]
@@ -37,8 +41,10 @@ def stages(tiny_world: Any, run: Run, folder: Path, turned: int | None) -> tuple
         write_track(tracks, track)
         own = folder / f"segment-{toss}"
         own.mkdir()
-        write_masks(own, toss, [tiny_world.see(p, i)[1] for i, p in enumerate(tiny_world.poses(n, toss))], np.ones(n))
-        masks[toss] = Done(own, f"masks {toss} {turned}", {}, False)
+        seen = [tiny_world.see(p, i)[1].astype(np.uint8) for i, p in enumerate(tiny_world.poses(n, toss))]
+        kernel = np.ones((2 * narrower_px + 1, 2 * narrower_px + 1), np.uint8)
+        write_masks(own, toss, [cv2.erode(mask, kernel) > 0 for mask in seen], np.ones(n))
+        masks[toss] = Done(own, f"masks {toss} {turned} {narrower_px}", {}, False)
     return Done(tracks, f"tracks {turned}", {}, False), masks
 
 
@@ -51,3 +57,15 @@ def test_a_toss_that_is_turned_against_the_others_is_kept_apart(
     together, masks = stages(tiny_world, run, tmp_path, turned)
     fused = _fused_stage(run, together, masks)
     assert of_one_shape(run, together, fused, masks, list(session.tosses)) == (kept, apart)
+
+
+def test_tosses_whose_masks_are_bad_alike_are_not_kept_apart(tiny_world: Any, tmp_path: Path) -> None:
+    """No shape explains such masks well, that of all tosses no worse than that of each alone."""
+    session = Session.open(tiny_world.record(tmp_path / "tiny", tosses=(0, 1), frames=6))
+    run = start_run(session, session.tosses, tmp_path / "out", Config(), "multi-hypothesis", lambda _: Silent())
+    together, masks = stages(tiny_world, run, tmp_path, None, narrower_px=2)
+    true_masks = stages(tiny_world, run, tmp_path / "true", None)[1]
+    fused = _fused_stage(run, together, true_masks)
+    left = _left(run, together, dict.fromkeys((0, 1), fused), masks)
+    assert max(left.values()) > run.config.cycle.apart_mask
+    assert of_one_shape(run, together, _fused_stage(run, together, masks), masks, [0, 1]) == ([0, 1], [])
