@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 from recordings.console import DONE, FELL_SHORT, Outcome, add_command, command_parser, progress_for, run_command
+from recordings.errors import BadInput
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -36,11 +38,32 @@ def _add(commands: Any, name: str, description: str, work: str, *examples: str) 
     return parser
 
 
+def positive_m(text: str) -> float:
+    """A length on the command line."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0 < value < 10:
+        raise argparse.ArgumentTypeError(f"{text}: wanted metres above 0, for instance 0.0614")
+    return value
+
+
+def _folder(path: Path) -> Path:
+    """A session, which alone has a calibration.json to write."""
+    if path.is_file():
+        raise BadInput(
+            f"{path} is a file; wanted a session folder, whose calibration.json is written: "
+            f"`toss-calibrate COMMAND {path.parent}`"
+        )
+    return path
+
+
 def _work(name: str) -> Callable[[argparse.Namespace], Outcome]:
     def work(args: argparse.Namespace) -> Outcome:
         module, function = name.split(":")
         done = getattr(importlib.import_module(f"calibration.{module}"), function)(
-            args.session, args, progress_for("toss-calibrate")
+            _folder(args.session), args, progress_for("toss-calibrate")
         )
         return Outcome(done.document, done.text, FELL_SHORT if done.refused else DONE)
 
@@ -124,7 +147,7 @@ def _time(commands: Any) -> None:
 
 
 def _object_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--tag-size", type=float, metavar="M", help="side of the object's tags in m (black square)")
+    parser.add_argument("--tag-size", type=positive_m, metavar="M", help="side of the object's tags' black square, m")
     parser.add_argument(
         "--tags", metavar="I-J", help="ids of the object's tags (default: all that are not on the table)"
     )

@@ -20,7 +20,17 @@ from calibration.intrinsics import Lens, calibrate_intrinsics
 from calibration.pictures import residual_picture
 from calibration.report import Finding, Report
 from calibration.tag_faults import explain_absence
-from calibration.views import COLOR, TOGETHER_NS, VIEWS_FILE, BoardViews, grey_images, read_board_views, table_target
+from calibration.targets import Tags
+from calibration.views import (
+    COLOR,
+    TOGETHER_NS,
+    VIEWS_FILE,
+    BoardViews,
+    board_of,
+    grey_images,
+    read_board_views,
+    table_target,
+)
 from recordings.errors import BadInput
 from recordings.geometry import DistortionModel, Transform
 from recordings.progress import Progress
@@ -126,8 +136,13 @@ def _board_views(session: Session, progress: Progress) -> BoardViews:
         return views
     with Toss(session.path / VIEWS_FILE) as toss:
         images = [grey_images(toss, camera)[1] for camera in toss.cameras()]
-        why = explain_absence([image for stack in images for image in stack], session.calibration.tag_family)
-    raise BadInput(f"{session.path / VIEWS_FILE}: the board is in none of the views: {why}")
+        board = board_of(session)
+        family = board.family if isinstance(board, Tags) else session.calibration.tag_family
+        why = explain_absence([image for stack in images for image in stack], family)
+    raise BadInput(
+        f"{session.path / VIEWS_FILE}: the board is in none of the views: {why}. Look at them with "
+        f"`toss-view {session.path / VIEWS_FILE}`; the board is described in session.json under `board`"
+    )
 
 
 def cameras(path: Path, args: argparse.Namespace, progress: Progress) -> Done:
@@ -139,7 +154,10 @@ def cameras(path: Path, args: argparse.Namespace, progress: Progress) -> Done:
         views = _board_views(session, progress)
         models = {n: session.calibration.cameras[n] for n in views.board if n in session.calibration.cameras}
         if len(models) < 2:
-            raise BadInput(f"{path}: {len(models)} cameras with known lenses in the views; wanted two or more")
+            raise BadInput(
+                f"{path}: {len(models)} cameras with known lenses in the views ({', '.join(models) or 'none'}); "
+                f"wanted two or more: `toss-calibrate intrinsics {path}` finds {', '.join(sorted(views.board))}"
+            )
         reference = COLOR if COLOR in models else sorted(models)[0]
         still = views.table if table_target(session.calibration) else None
         placed = calibrate_cameras(models, views.board, reference, still, args.lenses)

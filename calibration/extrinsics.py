@@ -36,6 +36,7 @@ UNDETERMINED = 1e-9
 BOARD, TABLE = 0, 1
 TABLE_PX = 0.8
 BOARD_SCALE = 0.003
+GOOD_PRINT_MM, WORST_PRINT_MM = 0.4, 1.5
 PRINT_M = 1.5e-4
 """A printed mark lies where it should be within this (standard deviation by axis): printer, paper, plate."""
 STEADY_PX = 0.05
@@ -300,7 +301,7 @@ def per_camera(names: Sequence[str], solved: Solved, seen: Observations) -> dict
 
 
 def _judge(names: Sequence[str], solved: Solved, seen: Observations) -> list[Finding]:
-    findings: list[Finding] = []
+    findings: list[Finding] = judge_print(solved)
     for name, figures in per_camera(names, solved, seen).items():
         findings += limit(figures["rms_px"], f"{name}'s residual", "px", GOOD_PX, WORST_PX)
         if figures["views"] < LEAST_VIEWS:
@@ -314,6 +315,13 @@ def _judge(names: Sequence[str], solved: Solved, seen: Observations) -> list[Fin
         findings += limit(mm, f"the standard deviation of {name}'s position", "mm", GOOD_MM, WORST_MM)
         findings += limit(deg, f"the standard deviation of {name}'s direction", "deg", GOOD_DEG, WORST_DEG)
     return findings
+
+
+def judge_print(solved: Solved) -> list[Finding]:
+    """Whether the board is laid out as it is said to be: a wrong size of its tags shows as marks out of place."""
+    shift_mm = 1e3 * float(np.sqrt((solved.scene.shift_m**2).sum(axis=1).mean())) if len(solved.scene.shift_m) else 0.0
+    what = "the distance of the board's marks from where its layout in session.json (sizes, pitch) has them"
+    return limit(shift_mm, what, "mm", GOOD_PRINT_MM, WORST_PRINT_MM)
 
 
 def spread(solved: Solved, camera: int) -> tuple[float, float]:

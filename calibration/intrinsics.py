@@ -17,7 +17,7 @@ from jaxtyping import Float
 from numpy import ndarray as Array
 
 from calibration.bundle import Observations, Scene, Solved, adjust
-from calibration.extrinsics import AS_GOOD, LEAST_POINTS, PRINT_M, bad_views, board_pose, whitening
+from calibration.extrinsics import AS_GOOD, LEAST_POINTS, PRINT_M, bad_views, board_pose, judge_print, whitening
 from calibration.projected import lens_numbers, with_lens
 from calibration.report import Finding, Report, limit
 from calibration.targets import TargetView, numbered_marks
@@ -72,11 +72,12 @@ def calibrate_intrinsics(
     fits = {kind: _Fit.of(_bare(first, kind), used) for kind in lens_models}
     kind = _simplest(fits)
     fit = fits[kind]
-    if given is not None and not anew and (given.width, given.height) == size:
-        kept = _kept(camera, given, fit, used)
-        if kept is not None:
-            return kept
+    kept = _kept(camera, given, fit, used) if given is not None and (given.width, given.height) == size else None
+    if kept is not None and not anew:
+        return kept
     findings = [*_judge(camera, fit, used, size), *_against_given(camera, given, fit.model)]
+    if kept is not None:
+        findings.append(_no_better(camera, fit))
     report = Report(
         "intrinsics",
         {"rms_px": fit.solved.rms_px, "views": len(np.unique(fit.seen.view)), "points": len(fit.seen)},
@@ -116,6 +117,15 @@ def _kept(camera: str, given: CameraModel, fit: _Fit, views: Sequence[TargetView
         },
     )
     return Lens(given, report, solved.residual_px, seen.pixels)
+
+
+def _no_better(camera: str, fit: _Fit) -> Finding:
+    open_by = _uncertainty(fit)["focal_percent"]
+    return Finding(
+        "warning",
+        f"{camera}: the lens given before explains these views as well as the fitted one; they leave focal "
+        f"lengths open by {open_by:.2f} % (this camera alone): without --anew the given one is kept",
+    )
 
 
 def coverage(pixels: Float[Array, "n 2"], size: tuple[int, int]) -> float:
@@ -216,6 +226,7 @@ def _judge(camera: str, fit: _Fit, views: Sequence[TargetView], size: tuple[int,
     found = limit(fit.solved.rms_px, f"{camera}'s residual", "px", GOOD_PX, WORST_PX)
     found += limit(fit.hold_out_px, f"{camera}'s residual on views kept aside", "px", GOOD_PX, WORST_PX)
     focal = _uncertainty(fit)["focal_percent"]
+    found += judge_print(fit.solved)
     found += limit(focal, f"the deviation of {camera}'s focal length", "%", GOOD_FOCAL_PERCENT, WORST_FOCAL_PERCENT)
     if fit.rejected:
         found.append(Finding("note", f"{camera}: {len(fit.rejected)} views left out for their residuals"))

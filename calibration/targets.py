@@ -17,6 +17,8 @@ from recordings.progress import Progress
 
 CORNERS = 0.5 * np.array([[-1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [-1.0, -1.0, 0.0]])
 """Of a tag of side 1 in its own frame (x right, y down, z into the paper), in the detector's order."""
+NOT_TURNED = 1e-3
+"""R R^T may differ from 1 by this."""
 CORNER_SIGMA_PX = 0.1
 """Of a chessboard's corner: OpenCV gives none."""
 
@@ -171,17 +173,38 @@ def target_from_document(document: Mapping[str, Any], where: str) -> Target:
         kind = document.get("kind", "tags" if "tags" in document else None)
         if kind == "tags":
             tags = list(document["tags"])
-            return Tags(
-                str(document.get("family", "tag36h11")),
-                {int(t["id"]): float(t["size_m"]) for t in tags},
-                {int(t["id"]): np.array(t["T_board_tag"], dtype=np.float64) for t in tags},
+            return _sound(
+                Tags(
+                    str(document.get("family", "tag36h11")),
+                    {int(t["id"]): float(t["size_m"]) for t in tags},
+                    {int(t["id"]): np.array(t["T_board_tag"], dtype=np.float64) for t in tags},
+                ),
+                where,
             )
         if kind not in ("charuco", "chessboard"):
             raise BadInput(f"{where}: a calibration board of kind {kind!r}; wanted tags, charuco or chessboard")
         sizes = (int(document["columns"]), int(document["rows"]), float(document["square_m"]))
+        if min(sizes[:2]) < 2 or not 0 < sizes[2] < np.inf:
+            raise BadInput(
+                f"{where}: a board of {sizes[0]} x {sizes[1]} squares of {sizes[2]:g} m; wanted two or more each way, "
+                "and square_m above 0"
+            )
         if kind == "charuco":
             dictionary = str(document.get("dictionary", "DICT_5X5_100"))
             return Charuco(*sizes, float(document["marker_m"]), dictionary, bool(document.get("legacy", False)))
         return Chessboard(*sizes)
     except (KeyError, TypeError, ValueError) as wrong:
         raise BadInput(f"{where}: the calibration board: {type(wrong).__name__} {wrong}; see README.md") from wrong
+
+
+def _sound(target: Tags, where: str) -> Tags:
+    """As given. Raises BadInput naming the tag whose size or place cannot be."""
+    for tag, place in target.board_from_tag.items():
+        turn = place[:3, :3] if place.shape == (4, 4) else np.zeros((3, 3))
+        if not 0 < target.size_m[tag] < np.inf:
+            raise BadInput(f"{where}: tag {tag} of the board has size_m {target.size_m[tag]:g}; wanted metres above 0")
+        if not np.isfinite(place).all() or np.abs(turn @ turn.T - np.eye(3)).max() > NOT_TURNED:
+            raise BadInput(
+                f"{where}: T_board_tag of tag {tag} is no pose; wanted a 4x4 of finite numbers (rotation, metres)"
+            )
+    return target

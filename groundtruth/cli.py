@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from calibration.cli import positive_m
 from recordings.console import DONE, FELL_SHORT, Outcome, Usage, command_parser, json_text, progress_for, run_command
 from recordings.errors import BadInput
 
@@ -39,7 +40,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _parser() -> Any:
     parser = command_parser("toss-truth", DESCRIPTION, *EXAMPLES)
     parser.add_argument("session", type=Path, metavar="SESSION", help="a session folder, or: tagslam DIR")
-    parser.add_argument("--tag-size", type=float, metavar="M", help="side of the object's tags' black square, metres; "
+    parser.add_argument("--tag-size", type=positive_m, metavar="M", help="side of the tags' black square, metres; "
                         "left out, it is measured between cameras of known place")  # fmt: skip
     parser.add_argument("--layout", type=Path, metavar="FILE", help="known places of the tags on the object: JSON with "
                         "tags [{id, size_m, T_tagged_tag or T_object_tag}]")  # fmt: skip

@@ -5,6 +5,7 @@ from __future__ import annotations
 import bz2
 import shutil
 import tempfile
+import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -80,7 +81,7 @@ def _read_npz(path: Path) -> Recording:
                 tail = name[len("odom_stamp_ns__") :]
                 odometry["/" + tail.replace("__", "/")] = (data[name], _poses(data[f"odom_xyz_qxyzw__{tail}"]))
         return Recording(frames, odometry)
-    except (KeyError, ValueError, OSError, IndexError) as wrong:
+    except (KeyError, ValueError, OSError, IndexError, EOFError, zipfile.BadZipFile) as wrong:
         raise BadInput(f"{path} is not a recording of detections ({type(wrong).__name__}: {wrong})") from wrong
 
 
