@@ -149,7 +149,7 @@ class RobotMasks:
     def of(folder: Path, toss: int) -> RobotMasks | None:
         """Those beside a stage's masks; None where no robot was drawn."""
         path = folder / f"{_stem(toss)}.robot"
-        return RobotMasks(path) if path.is_dir() else None
+        return RobotMasks(path) if any(path.glob("*.png")) else None
 
     def at(self, position: int, shape: tuple[int, int]) -> Bool[Array, "h w"]:
         """The robot's pixels in one frame; all of them where it was not drawn there, because it may be anywhere."""
@@ -197,7 +197,8 @@ class VariantRecord:
     """What one variant in one scope ended with, as `variants/<name>.<scope>.json` keeps it.
 
     `shape` is the stage folder of the variant's one shape (scope all). `shared_object_frame`: the tracks of all tosses
-    are in one object frame. `session_path` is relative to the results folder. `notes` are to be read by a person.
+    are in one object frame. `session_path` is relative to the results folder. `warnings` (what to know before using the
+    result) and `notes` (how it was made) are to be read by a person.
     """
 
     name: str
@@ -211,6 +212,7 @@ class VariantRecord:
     contact: str | None = None
     shared_object_frame: bool = False
     session_path: str = ""
+    warnings: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     extra: Mapping[str, Any] = field(default_factory=dict)
 
@@ -228,6 +230,7 @@ def write_variant(results: Path, record: VariantRecord) -> Path:
     document = {k: v for k, v in vars(record).items() if k not in ("calibration", "tosses", "extra")}
     document |= {
         "format_version": RESULTS_FORMAT,
+        "warnings": list(record.warnings),
         "notes": list(record.notes),
         "tosses": [vars(t) for t in record.tosses],
         "calibration": record.calibration.to_json(),
@@ -249,6 +252,7 @@ def _read_variant(path: Path) -> VariantRecord:
                 **document,
                 "calibration": RigCalibration.from_json(document["calibration"]),
                 "tosses": tuple(TossRecord(**t) for t in document["tosses"]),
+                "warnings": tuple(document.get("warnings", ())),
                 "notes": tuple(document.get("notes", ())),
             }
         )

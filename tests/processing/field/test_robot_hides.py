@@ -56,7 +56,10 @@ def test_what_the_robot_hides_stays_part_of_the_shape(tiny_world: Any, toss: Any
 def test_where_no_robot_was_drawn_it_may_be_anywhere(tmp_path: Path) -> None:
     assert RobotMasks.of(tmp_path, 3) is None
     (tmp_path / "toss_03.robot").mkdir()
+    assert RobotMasks.of(tmp_path, 3) is None
+    cv2.imwrite(str(tmp_path / "toss_03.robot" / "000001.png"), np.eye(4, 5, dtype=np.uint8) * 255)
     robot = RobotMasks.of(tmp_path, 3)
     assert robot is not None
+    np.testing.assert_array_equal(robot.at(1, (4, 5)), np.eye(4, 5, dtype=bool))
     assert robot.at(0, (4, 5)).shape == (4, 5)
     assert robot.at(0, (4, 5)).all()
