@@ -24,6 +24,7 @@ from calibration.ground_plane import (
     place_world,
     table_points,
 )
+from calibration.pictures import table_picture
 from calibration.poses import inverse_poses
 from calibration.tag_faults import explain_absence
 from calibration.tags import detect_tags
@@ -74,12 +75,34 @@ def table(path: Path, args: argparse.Namespace, progress: Progress) -> Done:
         plane_world = plane.in_frame(world_from_rig)
         gravity = _gravity(session, args, world_from_rig, progress)
         report = judge_table(plane_world, residuals, hold_out, tags_px, scale, gravity)
+        picture = _picture(session, plane_world, world_from_rig, depth_points, scale, target)
         if args.dry_run or report.verdict == "refused":
-            return done([report], None, [], not args.dry_run)
+            return done([report], None, [picture], not args.dry_run)
         moved = [world_from_rig] if args.move_world else []
         changed = store.updated(calibration, transforms=moved, replaces=["world"] if moved else [])
         written = store.write(session, changed, "table", report, **_plane_entry(plane_world, tags, depth_points))
-        return done([report], written, [], True)
+        return done([report], written, [picture], True)
+
+
+def _picture(
+    session: Session,
+    plane_world: Plane,
+    world_from_rig: Transform,
+    depth_m: Float[Array, "n 3"] | None,
+    scale: float | None,
+    target: Tags | None,
+) -> Path:
+    """Depth over the table, its scale taken out as the plane's fit had it."""
+    near = np.zeros((0, 3)) if depth_m is None else depth_m / (scale or 1.0)
+    points = world_from_rig.points(near)
+    corners = [target.corners_m(i)[:, :2] for i in target.board_from_tag] if target is not None else []
+    return table_picture(
+        store.work_folder(session) / "table.png",
+        f"{session.name}: table",
+        points,
+        plane_world.heights_m(points),
+        np.concatenate([np.zeros((0, 2)), *corners]),
+    )
 
 
 def _plane_entry(plane: Plane, tags: object, depth: object) -> dict[str, object]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from numpy import ndarray as Array
 from calibration import store
 from calibration.commands import TOOL, Done, done
 from calibration.extrinsics import spread
-from calibration.pictures import residual_picture
+from calibration.pictures import offsets_picture, residual_picture
 from calibration.poses import inverse_poses
 from calibration.report import Finding, Report, limit
 from calibration.tagged_object import TaggedObject, solve_tagged_object
@@ -77,12 +78,26 @@ def time(path: Path, args: argparse.Namespace, progress: Progress) -> Done:
             reports["arm"] = offset_report("arm", COLOR, arm, {})
         first = reports["mono"]
         reports["mono"] = replace(first, findings=(*first.findings, *findings))
+        picture = _offsets_picture(session, reports, {"mono": mono, "arm": arm})
         if args.dry_run or any(r.verdict == "refused" for r in reports.values()):
-            return done(list(reports.values()), None, [], not args.dry_run)
+            return done(list(reports.values()), None, [picture], not args.dry_run)
         offsets = {name: _offset_entry(report) for name, report in reports.items()}
         entry = {"reference": COLOR, "offsets": offsets, **{n: r.to_json() for n, r in reports.items()}}
         written = store.write_entry(session, session.calibration, "time", entry)
-        return done(list(reports.values()), written, [], True)
+        return done(list(reports.values()), written, [picture], True)
+
+
+def _offsets_picture(
+    session: Session, reports: Mapping[str, Report], by_toss: Mapping[str, Mapping[int, TimeOffset]]
+) -> Path:
+    values = {
+        stream: {
+            **{str(k): (1e3 * o.offset_s, 1e3 * o.std_s) for k, o in sorted(by_toss[stream].items())},
+            "pooled": (float(report.residuals["offset_ms"]), float(report.uncertainty["offset_ms"])),
+        }
+        for stream, report in reports.items()
+    }
+    return offsets_picture(store.work_folder(session) / "time.png", f"{session.name}: clocks", values)
 
 
 def _offset_entry(report: Report) -> dict[str, int]:

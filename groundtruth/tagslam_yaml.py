@@ -74,7 +74,7 @@ def load(path: Path) -> dict[str, Any]:
     try:
         document = yaml.safe_load(_times_as_text(text))
     except yaml.YAMLError as wrong:
-        raise BadInput(f"{path} is no readable YAML ({wrong})") from wrong
+        raise BadInput(f"{path} is no readable YAML ({' '.join(str(wrong).split())})") from wrong
     if not isinstance(document, dict):
         raise BadInput(f"{path}: wanted a mapping at the top, found {type(document).__name__}")
     return document

@@ -323,6 +323,38 @@ def test_charuco_and_chessboards_are_found_where_they_were_drawn():
     assert find_target(Chessboard(6, 5, 0.03), [np.full((200, 200), 128, np.uint8)]) == [NOTHING]
 
 
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"size_m": -0.05}, "tag 3 of the board has size_m -0.05; wanted metres above 0"),
+        ({"size_m": float("nan")}, "size_m nan"),
+        ({"T_board_tag": np.full((4, 4), np.nan).tolist()}, "T_board_tag of tag 3 is no pose"),
+        ({"T_board_tag": np.diag([2.0, 1, 1, 1]).tolist()}, "T_board_tag of tag 3 is no pose"),
+        ({"T_board_tag": [[1.0, 0.0]]}, "T_board_tag of tag 3 is no pose"),
+    ],
+)
+def test_a_board_that_cannot_be_is_refused_naming_its_tag(change, said):
+    tag = {"id": 3, "size_m": 0.05, "T_board_tag": np.eye(4).tolist(), **change}
+    with pytest.raises(BadInput, match=said):
+        target_from_document({"family": "tag36h11", "tags": [tag]}, "session.json")
+    with pytest.raises(BadInput, match="wanted two or more each way"):
+        target_from_document({"kind": "chessboard", "columns": 1, "rows": 7, "square_m": 0.02}, "session.json")
+
+
+def test_tags_of_a_wrong_size_on_a_board_of_the_right_pitch_are_refused(geometry, rig):
+    """The board then looks like a larger one whose tags are pushed together: nothing but their places tells."""
+    views = views_of(geometry, rig)
+    middle = {i: geometry.board.corners_m(i).mean(axis=0) for i in geometry.board.size_m}
+
+    def larger(view):
+        at = np.array([middle[i] for i in (view.ids // 4).tolist()])
+        return replace(view, points_m=at + 1.1 * (view.points_m - at), marks=view.ids // 4)
+
+    placed = calibrate_cameras(rig[0], {n: [larger(v) for v in looks] for n, looks in views.items()}, "d455")
+    assert placed.report.verdict == "refused"
+    assert any("from where its layout" in reason for reason in placed.report.reasons())
+
+
 def test_a_board_is_read_from_its_document_or_refused():
     found = target_from_document({"kind": "charuco", "columns": 6, "rows": 5, "square_m": 0.04, "marker_m": 0.03}, "x")
     assert found == Charuco(6, 5, 0.04, 0.03)

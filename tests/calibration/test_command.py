@@ -53,7 +53,7 @@ def test_a_refused_calibration_leaves_the_file_as_it_was_and_returns_1(cube_copy
 
 
 @pytest.mark.slow
-def test_the_table_and_the_clock_offset_of_a_toss(cube_copy, capsys):
+def test_the_table_and_the_clock_offset_of_a_toss(cube_copy, cube_truth, capsys):
     assert main(["cameras", str(cube_copy)]) == 0
     assert main(["table", str(cube_copy), "--tag-size", TAG_M]) == 0
     table = calibration_of(cube_copy).residuals["table"]
@@ -66,7 +66,13 @@ def test_the_table_and_the_clock_offset_of_a_toss(cube_copy, capsys):
     capsys.readouterr()
     assert main(["time", str(cube_copy), "--tag-size", "0.07"]) == 1
     assert "wrong tag size" in capsys.readouterr().out
-    assert main(["cameras", str(cube_copy), "--from", "object", "--tag-size", TAG_M, "--dry-run"]) == 0
+    assert main(["cameras", str(cube_copy), "--from", "object", "--tag-size", TAG_M]) == 0
+    found = calibration_of(cube_copy)
+    for camera in ("mono1", "mono2"):
+        true = inverse_poses(cube_truth["mono0"]) @ cube_truth[camera]
+        gap = inverse_poses(true) @ found.transform("mono0", camera).matrix
+        assert np.linalg.norm(gap[:3, 3]) < 1e-3
+        assert angle_deg(gap[:3, :3]) < 0.1
 
 
 def test_what_is_missing_is_named_with_what_to_type(cube_copy, sample_path, capsys):
@@ -75,3 +81,7 @@ def test_what_is_missing_is_named_with_what_to_type(cube_copy, sample_path, caps
     assert main(["hand-eye", str(sample_path)]) == 2
     assert "toss-record --calibration" in capsys.readouterr().err
     assert main([]) == 2
+    assert main(["cameras", str(cube_copy / "toss_00.mcap")]) == 2
+    assert "wanted a session folder" in capsys.readouterr().err
+    assert main(["time", str(cube_copy), "--tag-size", "-1"]) == 2
+    assert "wanted metres above 0" in capsys.readouterr().err

@@ -160,3 +160,9 @@ def test_a_link_to_another_tests_bag_is_followed_where_that_is_packed(data, writ
     packed.write_bytes((data("tagslam_test") / "test_01" / "tag_detections.bag.bz2").read_bytes())
     (folder / "tag_detections.bag").symlink_to("other.bag")
     assert sum(map(len, read_recording(folder).frames.values())) == 269
+
+
+def test_a_damaged_recording_is_named(written):
+    (written / "detections.npz").write_bytes(b"PK\x03\x04 cut off")
+    with pytest.raises(BadInput, match="is not a recording of detections"):
+        read_recording(written)
