@@ -173,14 +173,10 @@ def target_from_document(document: Mapping[str, Any], where: str) -> Target:
         kind = document.get("kind", "tags" if "tags" in document else None)
         if kind == "tags":
             tags = list(document["tags"])
-            return _sound(
-                Tags(
-                    str(document.get("family", "tag36h11")),
-                    {int(t["id"]): float(t["size_m"]) for t in tags},
-                    {int(t["id"]): np.array(t["T_board_tag"], dtype=np.float64) for t in tags},
-                ),
-                where,
-            )
+            sizes_m = {int(t["id"]): float(t["size_m"]) for t in tags}
+            places = {int(t["id"]): np.array(t["T_board_tag"], dtype=np.float64) for t in tags}
+            _check_tags(sizes_m, places, where)
+            return Tags(str(document.get("family", "tag36h11")), sizes_m, places)
         if kind not in ("charuco", "chessboard"):
             raise BadInput(f"{where}: a calibration board of kind {kind!r}; wanted tags, charuco or chessboard")
         sizes = (int(document["columns"]), int(document["rows"]), float(document["square_m"]))
@@ -197,14 +193,13 @@ def target_from_document(document: Mapping[str, Any], where: str) -> Target:
         raise BadInput(f"{where}: the calibration board: {type(wrong).__name__} {wrong}; see README.md") from wrong
 
 
-def _sound(target: Tags, where: str) -> Tags:
-    """As given. Raises BadInput naming the tag whose size or place cannot be."""
-    for tag, place in target.board_from_tag.items():
+def _check_tags(size_m: Mapping[int, float], board_from_tag: Mapping[int, Array], where: str) -> None:
+    """Raises BadInput naming the tag whose size or place cannot be."""
+    for tag, place in board_from_tag.items():
         turn = place[:3, :3] if place.shape == (4, 4) else np.zeros((3, 3))
-        if not 0 < target.size_m[tag] < np.inf:
-            raise BadInput(f"{where}: tag {tag} of the board has size_m {target.size_m[tag]:g}; wanted metres above 0")
+        if not 0 < size_m[tag] < np.inf:
+            raise BadInput(f"{where}: tag {tag} of the board has size_m {size_m[tag]:g}; wanted metres above 0")
         if not np.isfinite(place).all() or np.abs(turn @ turn.T - np.eye(3)).max() > NOT_TURNED:
             raise BadInput(
                 f"{where}: T_board_tag of tag {tag} is no pose; wanted a 4x4 of finite numbers (rotation, metres)"
             )
-    return target

@@ -163,6 +163,7 @@ def test_a_link_to_another_tests_bag_is_followed_where_that_is_packed(data, writ
 
 
 def test_a_damaged_recording_is_named(written):
-    (written / "detections.npz").write_bytes(b"PK\x03\x04 cut off")
+    folder = written()
+    (folder / "detections.npz").write_bytes(b"PK\x03\x04 cut off")
     with pytest.raises(BadInput, match="is not a recording of detections"):
-        read_recording(written)
+        read_recording(folder)
