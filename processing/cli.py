@@ -197,7 +197,7 @@ def _started(args: argparse.Namespace, run: Run) -> Run:
 
     starts = start_poses(args.truth, run.session, run.tosses, "d455")
     note = "start: the first pose of every toss is the true one (--start truth)"
-    return replace(run, starts=starts, notes=(*run.notes, note))
+    return replace(run, starts=starts, warnings=(*run.warnings, note))
 
 
 def learned_shape_of(results_path: Path) -> Path:

@@ -36,7 +36,8 @@ if TYPE_CHECKING:
 @dataclass(frozen=True, eq=False)
 class Pass:
     """Where a pass ended, per toss: the stages that hold its track, its masks, and the shape in the track's object
-    frame. `passes`: what each pass of the cycle changed and how well it explains the raw images."""
+    frame. `passes`: what each pass of the cycle changed and how well it explains the raw images.
+    `warnings` are what a reader must know before he uses the result, `notes` how it was made."""
 
     tracks: Mapping[int, Done]
     shapes: Mapping[int, Done]
@@ -44,6 +45,7 @@ class Pass:
     shared_frame: bool
     contact: Mapping[int, Done] = field(default_factory=dict)
     rollout: Done | None = None
+    warnings: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     passes: tuple[Mapping[str, Any], ...] = ()
 
@@ -56,6 +58,7 @@ class Pass:
             {t: d for p in parts for t, d in p.masks.items()},
             shared_frame=False,
             contact={t: d for p in parts for t, d in p.contact.items()},
+            warnings=tuple(dict.fromkeys(w for p in parts for w in p.warnings)),
             notes=tuple(dict.fromkeys(n for p in parts for n in p.notes)),
             passes=tuple(x for p in parts for x in p.passes),
         )
@@ -73,8 +76,13 @@ def run_cycle(run: Run, variant: Variant, start: Pass, name: str) -> Pass:
     if told["worse_share"] > run.config.cycle.much_worse:
         worse = f"explains the raw images worse by {100 * told['worse_share']:.1f} %"
         note = f"{name}: the second pass {worse}: kept out, poses and shape are those before it"
-        return replace(refined, passes=(told,), notes=(*refined.notes, note))
-    ended = replace(ended, passes=(told,), notes=(*ended.notes, *_said(told), *departures(run.config.cycle)))
+        return replace(refined, passes=(told,), warnings=(*refined.warnings, note))
+    ended = replace(
+        ended,
+        passes=(told,),
+        warnings=(*ended.warnings, *_said(told)),
+        notes=(*ended.notes, *departures(run.config.cycle)),
+    )
     return _until_converged(run, ended, name) if variant.refined == "converged" else ended
 
 
@@ -99,7 +107,7 @@ def with_contact(run: Run, start: Pass, name: str) -> Pass:
     learned = contact_stage(run, name, start.tracks, shape)
     kept_out = learned.counts.get("kept_out")
     if kept_out:
-        return replace(start, notes=(*start.notes, f"{name}: contact learning was kept out: {kept_out}"))
+        return replace(start, warnings=(*start.warnings, f"{name}: contact learning was kept out: {kept_out}"))
     vision, corrected = (
         judged_frames(judge_stage(run, name, start.tracks, dict.fromkeys(start.tracks, s), start.masks))
         for s in (shape, learned)
@@ -107,7 +115,7 @@ def with_contact(run: Run, start: Pass, name: str) -> Pass:
     contact, gap = dict.fromkeys(start.tracks, learned), difference(vision, corrected)
     if gap.worse:
         note = f"{name}: the shape that contact learned fits the raw depth worse than vision's ({gap}): kept out"
-        return replace(start, contact=contact, notes=(*start.notes, note))
+        return replace(start, contact=contact, warnings=(*start.warnings, note))
     return replace(start, shapes=dict.fromkeys(start.tracks, learned), contact=contact)
 
 
@@ -138,8 +146,8 @@ def _until_converged(run: Run, second: Pass, name: str) -> Pass:
         if told["same"]:
             note = f"converged: pass {number} changed nothing more"
             return replace(best, passes=tuple(passes), notes=(*best.notes, note))
-    note = f"not converged after {run.config.cycle.most_passes} passes more"
-    return replace(best, passes=tuple(passes), notes=(*best.notes, note))
+    warning = f"not converged after {run.config.cycle.most_passes} passes more"
+    return replace(best, passes=tuple(passes), warnings=(*best.warnings, warning))
 
 
 def _joint(run: Run, start: Pass, name: str) -> Pass:
@@ -150,10 +158,10 @@ def _joint(run: Run, start: Pass, name: str) -> Pass:
     tracks = dict.fromkeys(begun.tracks, solved)
     learned = contact_stage(run, name, tracks, solved)
     kept_out = learned.counts.get("kept_out")
-    notes = [f"{name}: contact learning was kept out: {kept_out}"] if kept_out else []
-    notes += [f"{name}: {solved.counts['kept_out']}"] if "kept_out" in solved.counts else []
+    warnings = [f"{name}: contact learning was kept out: {kept_out}"] if kept_out else []
+    warnings += [f"{name}: {solved.counts['kept_out']}"] if "kept_out" in solved.counts else []
     ended = replace(begun, tracks=tracks, shapes=tracks, contact={} if kept_out else dict.fromkeys(tracks, learned),
-                    notes=(*start.notes, *notes))  # fmt: skip
+                    warnings=(*start.warnings, *warnings))  # fmt: skip
     return replace(ended, passes=(_told(run, begun, ended, start.masks, name),))
 
 
@@ -223,12 +231,12 @@ def alone_start(run: Run, toss: int, first: Pass, alone: Done, masks: Done) -> P
 
     A toss that is lost in P does not say how O lies in it (it may be another object's): its own shape is taken.
     """
-    notes: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
     placed = place_stage(run, toss, first.tracks[toss], alone, first.shapes[toss])
     if not placed.counts["frames"]:
         placed = field_stage(run, f"toss {toss}", {toss: alone}, {toss: masks})
-        notes = (f"toss {toss} is lost among all tosses: the cycle begins with its own shape",)
-    return Pass({toss: alone}, {toss: placed}, {toss: masks}, shared_frame=False, notes=notes)
+        warnings = (f"toss {toss} is lost among all tosses: the cycle begins with its own shape",)
+    return Pass({toss: alone}, {toss: placed}, {toss: masks}, shared_frame=False, warnings=warnings)
 
 
 def place_stage(run: Run, toss: int, together: Done, alone: Done, shape: Done) -> Done:

@@ -22,16 +22,16 @@ def without_lost(run: Run, masks: Mapping[int, Done]) -> Run:
 
     Raises BadInput where no toss is left.
     """
-    run = replace(run, notes=(*run.notes, *_elsewhere(run, masks)))
+    run = replace(run, warnings=(*run.warnings, *_elsewhere(run, masks)))
     why = {t: reason for t in run.tosses if (reason := _why_lost(masks[t].counts)) is not None}
     if not why:
         return run
     if len(why) == len(run.tosses):
         told = "; ".join(f"toss {t}: {reason}" for t, reason in why.items())
         raise BadInput(f"{run.session.path}: no toss can be tracked ({told}). Look at the masks with `toss-view`")
-    notes = tuple(f"toss {t}: {reason}: lost, and left out of everything else" for t, reason in why.items())
+    warnings = tuple(f"toss {t}: {reason}: lost, and left out of everything else" for t, reason in why.items())
     kept = tuple(t for t in run.tosses if t not in why)
-    return replace(run, tosses=kept, lost=tuple(why), notes=(*run.notes, *notes))
+    return replace(run, tosses=kept, lost=tuple(why), warnings=(*run.warnings, *warnings))
 
 
 def _elsewhere(run: Run, masks: Mapping[int, Done]) -> list[str]:

@@ -70,7 +70,7 @@ class Run:
     progress: MakeProgress
     keys: Mapping[str, str]
     starts: Mapping[int, StartPose] = field(default_factory=dict)
-    notes: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
     lost: tuple[int, ...] = ()
     """Tosses in which the object is not seen: they show the scene and the robot only."""
 
@@ -133,7 +133,7 @@ def with_table(run: Run) -> Run:
     note = f"the table is from depth ({100 * found['share']:.0f} % of it, spread {1e3 * found['spread_m']:.1f} mm)"
     told = f"{note}; gravity is taken to be its normal"
     return replace(run, session=session, keys={**run.keys, "calibration": _calibration_key(session)},
-                   notes=(*run.notes, told))  # fmt: skip
+                   warnings=(*run.warnings, told))  # fmt: skip
 
 
 def process(run: Run, variant: Variant, scope: Scope) -> VariantRecord:
@@ -169,12 +169,13 @@ def process_with_model(run: Run, model: Path) -> VariantRecord:
 
 def _alone(run: Run, once: Mapping[int, Done], masks: Mapping[int, Done], scope: Scope) -> Pass:
     """p_i, O_i: in scope all only the first toss's shape is looked at."""
-    notes = ("each toss has its own object frame", *_unfit(once))
+    notes, warnings = ("each toss has its own object frame",), tuple(_unfit(once))
     if run.tracker == FrameToModel.name:
-        return Pass(once, once, masks, shared_frame=False, notes=notes)
+        return Pass(once, once, masks, shared_frame=False, warnings=warnings, notes=notes)
     wanted = run.tosses if scope == "one" else run.tosses[:1]
     shapes = {t: field_stage(run, f"toss {t}", {t: once[t]}, {t: masks[t]}) for t in wanted}
-    return Pass(once, {t: shapes.get(t, shapes[wanted[0]]) for t in run.tosses}, masks, shared_frame=False, notes=notes)
+    whose = {t: shapes.get(t, shapes[wanted[0]]) for t in run.tosses}
+    return Pass(once, whose, masks, shared_frame=False, warnings=warnings, notes=notes)
 
 
 def _unfit(once: Mapping[int, Done]) -> list[str]:
@@ -196,20 +197,24 @@ def _all_together(run: Run, once: Mapping[int, Done], masks: Mapping[int, Done])
     together = register_stage(run, dict(once), dict(masks))
     tracks = dict.fromkeys(run.tosses, together)
     left_out = together.counts["not_joined"]
-    notes = _unfit(once)
-    notes += [f"tosses {left_out} could not be brought into the object frame of the others: lost"] if left_out else []
+    warnings = _unfit(once)
+    warnings += (
+        [f"tosses {left_out} could not be brought into the object frame of the others: lost"] if left_out else []
+    )
     unsure = together.counts.get("ambiguous")
     if unsure:
-        notes.append(f"tosses {unsure}: the object looks alike from several sides; their object frame may be turned")
+        warnings.append(f"tosses {unsure}: the object looks alike from several sides; their object frame may be turned")
     joined = [t for t in run.tosses if t not in left_out]
     shape = field_stage(run, "all tosses", dict.fromkeys(joined, together), {t: masks[t] for t in joined})
     kept, apart = of_one_shape(run, together, shape, masks, joined)
     if apart:
-        notes.append(f"tosses {apart}: their place among the others is wrong, no one shape explains both: kept apart")
+        warnings.append(
+            f"tosses {apart}: their place among the others is wrong, no one shape explains both: kept apart"
+        )
         shape = field_stage(run, "all tosses", dict.fromkeys(kept, together), {t: masks[t] for t in kept})
     there = [t for t in run.tosses if t not in apart]
     return Pass({t: tracks[t] for t in there}, dict.fromkeys(there, shape), {t: masks[t] for t in there},
-                shared_frame=not apart, notes=tuple(notes))  # fmt: skip
+                shared_frame=not apart, warnings=tuple(warnings))  # fmt: skip
 
 
 def _with_apart(run: Run, last: Pass, once: Mapping[int, Done], masks: Mapping[int, Done]) -> Pass:
@@ -241,7 +246,7 @@ def _with_rollouts(run: Run, ended: Pass) -> Pass:
     """The paper's Figure 4 on the row's last tracks and shape."""
     done = rollout_stage(run, "all tosses", ended.tracks, next(iter(ended.shapes.values())))
     why = done.counts.get("kept_out")
-    return replace(ended, notes=(*ended.notes, f"no rollouts: {why}")) if why else replace(ended, rollout=done)
+    return replace(ended, warnings=(*ended.warnings, f"no rollouts: {why}")) if why else replace(ended, rollout=done)
 
 
 def _record(run: Run, variant: Variant, scope: Scope, last: Pass, masks: Mapping[int, Done]) -> VariantRecord:
@@ -261,7 +266,8 @@ def _record(run: Run, variant: Variant, scope: Scope, last: Pass, masks: Mapping
         contact=next(iter(contact.values()), None) if scope == "all" else None,
         shared_object_frame=last.shared_frame,
         session_path=os.path.relpath(run.session.path.resolve(), run.store.results.resolve()),
-        notes=(f"tracker: {run.tracker}", *run.notes, *last.notes),
+        warnings=(*run.warnings, *last.warnings),
+        notes=(f"tracker: {run.tracker}", *last.notes),
         extra={
             "tracker": run.tracker,
             "contact_of_toss": contact,

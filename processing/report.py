@@ -16,7 +16,7 @@ from numpy import ndarray as Array
 from processing.metrics import distance_to_surface_m
 from processing.report_curves import error_curves, rollout_curves
 from processing.report_shapes import ERROR_FULL_MM, Shown, shape_picture, true_shape
-from processing.table import COLUMNS, Row
+from processing.table import COLUMNS, Row, said
 from recordings.geometry import CameraModel
 from recordings.results import Results
 from recordings.session import Session
@@ -43,11 +43,10 @@ def write_report(
     truth: trimesh.Trimesh | None = None,
 ) -> None:
     """Write report.html into the results folder; it loads nothing from anywhere. `truth`: the true mesh, shown too."""
-    warnings = [f"{r['variant']} ({r['scope']}): {w}" for r in document["rows"] for w in r["warnings"]]
     main = _main_row(rows)
     parts = [
         f"<h1>{escape(session.name)}: {escape(session.object_name)}</h1>",
-        _warnings([*dict.fromkeys(warnings), *_lost(document)]),
+        _warnings([*said(document["rows"], "warnings"), *_lost(document)]),
         _recorded(document, session),
         "<h2>Scores</h2>",
         _score_table(document),
@@ -162,8 +161,8 @@ def _phases_table(main: Row | None) -> str:
 
 
 def _notes(document: dict[str, Any]) -> str:
-    lines = [f"{r['variant']} ({r['scope']}): {n}" for r in document["rows"] for n in r["notes"]]
-    return f"<h2>Notes</h2><ul>{''.join(f'<li>{escape(line)}</li>' for line in lines)}</ul>"
+    lines = "".join(f"<li>{escape(line)}</li>" for line in said(document["rows"], "notes"))
+    return f"<h2>Notes</h2><ul>{lines}</ul>"
 
 
 def _picture(data: bytes, caption: str, kind: str = "png") -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, Literal
 
 from processing.score import TossScore, VariantScore
 from processing.variants import TABLE
@@ -66,7 +66,7 @@ def _row_document(results: Results, row: Row) -> dict[str, Any]:
         "per_toss": [
             {"toss": toss, **status_counts(track), **_toss_values(score, toss)} for toss, track in row.tracks.items()
         ],
-        "warnings": list(score.warnings if score else ("no ground truth: nothing could be scored",)),
+        "warnings": [*record.warnings, *(score.warnings if score else ("no ground truth: nothing could be scored",))],
         "notes": list(record.notes),
         "stages": {s: results.stage(s).get("key", "") for s in stages},
         "paper": None if paper is None else dict(zip(("adds_auc", "add_auc", "success_5deg_5cm", "cd"), paper)),
@@ -91,9 +91,18 @@ def markdown(document: dict[str, Any]) -> str:
         "floor: each toss's frames fused at the true poses: what one toss can show of the shape at all.",
         "In brackets: the paper's figure for this row, on the paper's own data.",
     ]
-    for row in rows:
-        lines += [f"- {row['variant']} ({row['scope']}): {w}" for w in (*row["warnings"], *row["notes"])]
+    lines += [f"- {line}" for kind in ("warnings", "notes") for line in said(rows, kind)]
     return "\n".join(lines) + "\n"
+
+
+def said(rows: Sequence[dict[str, Any]], kind: Literal["warnings", "notes"]) -> list[str]:
+    """What is said of the rows, each sentence once, with the rows that it is said of before it."""
+    whose: dict[str, list[str]] = {}
+    for row in rows:
+        for line in row[kind]:
+            whose.setdefault(line, []).append(f"{row['variant']} ({row['scope']})")
+    every = len(rows) if len(rows) > 1 else 0
+    return [f"{'every row' if len(of) == every else ', '.join(of)}: {line}" for line, of in whose.items()]
 
 
 def _block(rows: Sequence[dict[str, Any]]) -> list[str]:

@@ -93,7 +93,7 @@ def run_row(session: Session, tosses: Sequence[int], truth: Path, out: Path, nam
         if n in score.values
     )
     print(f"{name:13s} {figures} | {more} | {worst(score)}", flush=True)
-    for note in record.notes[1:]:
+    for note in (*record.warnings, *record.notes[1:]):
         print(f"{'':13s}   {note}")
 
 

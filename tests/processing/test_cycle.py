@@ -21,6 +21,7 @@ from processing.judge import JudgeConfig, ShapeDrawer, explain
 from processing.pipeline import start_run
 from processing.reproject import RaycastRenderer
 from processing.reprojected import RedrawConfig, SecondFrames, redraw
+from processing.table import said
 from processing.variants import TRACKERS, find_variant
 from recordings.geometry import rotation_exp
 from recordings.progress import Silent
@@ -255,11 +256,11 @@ def test_rows_share_their_stages(whole_table: Results) -> None:
 
 
 def test_what_contact_could_not_learn_is_said_and_the_rest_is_delivered(ours: Results) -> None:
-    notes = ours.find("ours", "all").notes
-    assert any("contact learning was kept out" in n for n in notes)
+    warnings = ours.find("ours", "all").warnings
+    assert any("contact learning was kept out" in w for w in warnings)
     assert len(ours.shape("ours", "all").faces) > 100
     page = (ours.path / "report.html").read_text()
-    assert "kept out" in page
+    assert page.index("kept out") < page.index("<h2>Scores")
     assert page.count("data:image/") >= 2
 
 
@@ -267,3 +268,13 @@ def test_the_second_pass_says_what_it_changed(ours: Results) -> None:
     passes = ours.find("ours", "all").extra["passes"]
     assert passes[0]["before"]["frames"] == passes[0]["after"]["frames"] > 0
     assert passes[0]["rotation_deg"] >= 0
+
+
+def test_what_is_said_of_several_rows_is_said_once() -> None:
+    rows: list[dict[str, Any]] = [
+        {"variant": "ours", "scope": "all", "warnings": ["toss 2 is lost"], "notes": ["tracker: x"]},
+        {"variant": "no-icp", "scope": "all", "warnings": ["toss 2 is lost", "no rollouts"], "notes": ["tracker: x"]},
+        {"variant": "ours", "scope": "one", "warnings": [], "notes": ["tracker: x"]},
+    ]
+    assert said(rows, "warnings") == ["ours (all), no-icp (all): toss 2 is lost", "no-icp (all): no rollouts"]
+    assert said(rows, "notes") == ["every row: tracker: x"]
