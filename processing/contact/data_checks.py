@@ -26,6 +26,9 @@ MOST_RATIO = 6.0
 FALL_TOLERANCE = 0.06
 """Relative error of the acceleration of free fall; 0.06 is 3 % of the step or 6 % of the scale."""
 PLANE_TOLERANCE_M = 0.005
+PLANE_BY_LOSS_M = (-0.007, 0.007)
+"""Where a right plane may be by the loss of a box: real tosses say 2.4 to 3.9 mm, tosses simulated with the project's
+own step -5 mm; a shift of the plane adds to it in full (tools/bench_contact.py plane)."""
 FALL_FRAMES = (20, 14, 10, 7, 5, 4)
 LONGEST_FALL_S = 0.2
 """Lengths of the windows in which a fall is looked for: a longer one at 30 Hz would span an impact."""
@@ -272,6 +275,18 @@ def check_plane(heights_m: Mapping[int, float], what: str) -> float | None:
             "or check the size of the shape"
         )
     return height
+
+
+def plane_warning(height_m: float | None) -> str | None:
+    """What to say of the plane by which a box fits best (intervals.plane_by_loss), which is only known to a few mm."""
+    if height_m is None or PLANE_BY_LOSS_M[0] <= height_m <= PLANE_BY_LOSS_M[1]:
+        return None
+    side = "above" if height_m > 0 else "below"
+    return (
+        f"a box fits these tosses best with the plane {1e3 * abs(height_m):.0f} mm {side} where it was said to be "
+        f"(right ones: {1e3 * PLANE_BY_LOSS_M[0]:.0f} to {1e3 * PLANE_BY_LOSS_M[1]:.0f} mm); the size is then off by "
+        "twice as much: calibrate the plane (`toss-calibrate table SESSION`)"
+    )
 
 
 def duplicate_groups(tosses: Sequence[PoseSeries]) -> list[tuple[int, ...]]:

@@ -15,7 +15,15 @@ from processing.contact.learn import ContactLearning
 from processing.contact.motion import PoseSeries
 from processing.contact.plane import Plane
 from processing.contact.prepared import Prepared, prepare, starts
-from processing.contact.rollout import Rollout, RolloutErrors, Start, rollout_errors, simulate
+from processing.contact.rollout import (
+    Rollout,
+    RolloutErrors,
+    Start,
+    fine_steps,
+    rollout_errors,
+    simulate,
+    simulate_law,
+)
 from processing.contact.smooth import Smoothed
 
 FIGURE_4_STEPS = 99
@@ -115,7 +123,8 @@ def evaluate(
     """
     prepared = prepared_for(learning, tracks, plane or Plane()) if ready is None else ready
     first = None if begin == "release" else [0 if begin == "first" else _thrown(s) for s in prepared.smoothed]
-    start, frames = starts(prepared, step_s, learning.fitted.inertia_start_kgm2, first)
+    fine_s = step_s if learning.law is None else step_s / fine_steps(step_s)
+    start, frames = starts(prepared, fine_s, learning.fitted.inertia_start_kgm2, first)
     return evaluate_from(learning, prepared, start, frames, steps, step_s, against, plane or Plane())
 
 
@@ -135,8 +144,12 @@ def evaluate_from(
     against: Sequence[PoseSeries] | None,
     plane: Plane,
 ) -> Evaluation:
-    """Roll out from given states."""
-    rolled = simulate(learning.body(), learning.fitted.geometry.contacts, start, steps, step_s)
+    """Roll out from given states (for steps of step_s, or for finer ones where the model has a law of contact)."""
+    body, contacts = learning.body(), learning.fitted.geometry.contacts
+    if learning.law is None:
+        rolled = simulate(body, contacts, start, steps, step_s)
+    else:
+        rolled = simulate_law(body, contacts, learning.law, start, steps, step_s)
     tracks: Sequence[PoseSeries] = prepared.tracks
     begin = list(first)
     if against is not None:

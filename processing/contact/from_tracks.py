@@ -256,6 +256,7 @@ def _fused(
         fit=found,
         fitted=model,
         solver_failures=learning.solver_failures + found.last_failures,
+        law=None if slow is None else slow.law,
     )
 
 

@@ -13,11 +13,19 @@ from numpy import ndarray as Array
 
 from processing.contact import data_checks as checks
 from processing.contact.fit import FRICTION, Fit, FitConfig, Model, fit
-from processing.contact.forecast import RigidBody
+from processing.contact.forecast import Law, RigidBody
 from processing.contact.friction import ForecastFriction, frames_are_slow, friction_by_forecasts
 from processing.contact.geometry import GeometryName
 from processing.contact.inertia import Physics
-from processing.contact.intervals import Interval, Spread, bootstrap, curvature, extents, plane_sensitivity
+from processing.contact.intervals import (
+    Interval,
+    Spread,
+    bootstrap,
+    curvature,
+    extents,
+    plane_by_loss,
+    plane_sensitivity,
+)
 from processing.contact.loss import REFERENCE_MASS_KG, Body, StepData, Weights, contact_loss
 from processing.contact.motion import PoseSeries, Steps
 from processing.contact.plane import Plane
@@ -83,6 +91,8 @@ class ContactLearning:
     data: StepData
     cpu_seconds: float
     seconds: float
+    law: Law | None = None
+    """Friction and restitution where they were found by forecasts: rollouts then obey them. None: inelastic."""
 
     @property
     def untouched_vertices(self) -> tuple[int, ...]:
@@ -133,6 +143,8 @@ def learn_contact(
     spread = _spread(fitted, optimum, data, weights, config, len(prepared.tracks))
     progress.step(4, 6, "intervals")
     sensitivity = plane_sensitivity(fitted, optimum, data, weights)
+    if not frames_are_slow(prepared.tracks) and len(prepared.tracks) > 2:
+        found["plane_by_loss_m"] = plane_by_loss(fitted, optimum, data, weights)
     progress.step(5, 6, "sensitivity")
     last, spread = with_friction(fits[-1], spread, slow)
     optimum = last.parameters
@@ -168,6 +180,7 @@ def learn_contact(
         data=data,
         cpu_seconds=cpu_seconds,
         seconds=time.perf_counter() - began,
+        law=None if slow is None else slow.law,
     )
 
 

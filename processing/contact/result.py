@@ -8,8 +8,14 @@ from typing import Any
 
 import numpy as np
 
+from processing.contact.data_checks import plane_warning
 from processing.contact.evaluate import Evaluation
 from processing.contact.learn import ContactLearning
+
+PLANE_NOTE = (
+    "the height of the plane and the size of the object are nearly one: poses alone show a plane that is far off only "
+    "for a box (checks.plane_by_loss_m); with a measured shape the resting object's lowest point shows it"
+)
 
 
 def result_document(learning: ContactLearning, evaluation: Evaluation | None) -> dict[str, Any]:
@@ -18,9 +24,11 @@ def result_document(learning: ContactLearning, evaluation: Evaluation | None) ->
     document: dict[str, Any] = {
         "geometry": learning.geometry,
         "friction": learning.friction.to_json(),
+        "restitution": None if learning.law is None else learning.law.restitution,
         "extents_m": [s.to_json() for s in sizes],
         "intervals_by": learning.spread.method,
         "ground_plane_sensitivity": dict(learning.plane_sensitivity),
+        "ground_plane_note": PLANE_NOTE,
         "transitions": learning.transitions,
         "solver_failures": learning.solver_failures,
         "untouched_vertices": list(learning.untouched_vertices),
@@ -75,6 +83,8 @@ def warnings_of(learning: ContactLearning) -> list[str]:
     if learning.untouched_vertices:
         count, of = len(learning.untouched_vertices), len(learning.touched)
         found.append(f"{count} of {of} points were never touched: the prior shape stands there")
+    if (plane := plane_warning(learning.checks.get("plane_by_loss_m"))) is not None:
+        found.append(plane)
     if len(learning.tosses) == 1:
         found.append("one toss only: its intervals come from the loss's curvature, and are wide")
     return found

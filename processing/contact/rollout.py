@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float
 from numpy import ndarray as Array
 from torch import Tensor
 
+from processing.contact.forecast import STEP_S, Law
 from processing.contact.loss import REFERENCE_MASS_KG, Body, jacobian, point_velocity
 from processing.contact.motion import GRAVITY_M_S2, PoseSeries, rotation_matrices, rotation_vectors
 from processing.contact.solver import in_cone, solve_cones
@@ -102,6 +103,34 @@ def simulate(
         rotations.append(rotation)
         positions.append(position - _turn(rotation, body.center_m) + body.lift_m)
     return Rollout(torch.stack(rotations, 1).cpu().numpy(), torch.stack(positions, 1).cpu().numpy(), failures)
+
+
+def simulate_law(body: Body, contacts: int, law: Law, start: Start, steps: int, step_s: float) -> Rollout:
+    """The same under a law of contact that rebounds, in finer steps of about STEP_S; `start` is for those
+    (fine_steps)."""
+    from processing.contact.steps_cpu import roll_rows
+
+    center, lift = body.center_m.cpu().numpy(), float(body.plane_m) * np.array([0.0, 0.0, 1.0])
+    points = body.points_m.cpu().numpy() - center
+    rotation, spin = np.array(start.rotation), np.array(start.spin_object_rad_s)
+    position = start.position_m + rotation @ center - lift
+    velocity = start.velocity_world_m_s + np.einsum("nij,nj->ni", rotation, np.cross(spin, center))
+    laws, owner = np.array([[law.friction, law.restitution]]), np.zeros(len(position), dtype=np.int64)
+    inertia, count = body.inertia_kgm2.cpu().numpy(), fine_steps(step_s)
+    most = min(contacts, len(points))
+    rotations, positions, failures = [], [], 0
+    for _ in range(steps):
+        state = (rotation, position, spin, velocity)
+        _, failed = roll_rows(*state, owner, laws, points, inertia, REFERENCE_MASS_KG, most, count, step_s / count)
+        failures += failed
+        rotations.append(rotation.copy())
+        positions.append(position - rotation @ center + lift)
+    return Rollout(np.stack(rotations, 1), np.stack(positions, 1), failures)
+
+
+def fine_steps(step_s: float) -> int:
+    """How many steps of about STEP_S a step of a rollout is made of under a law."""
+    return max(round(step_s / STEP_S), 1)
 
 
 def _after_contact(

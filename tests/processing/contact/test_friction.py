@@ -9,6 +9,7 @@ from processing.contact.motion import GRAVITY_M_S2, rotation_matrices
 from processing.contact.plane import Plane
 from processing.contact.prepared import prepare
 from processing.contact.prior import prior_from_size
+from processing.contact.rollout import Start, simulate, simulate_law
 from processing.contact.segment import Noise
 from processing.contact.steps_cpu import roll_rows
 
@@ -106,3 +107,20 @@ def test_in_flight_no_friction_forecasts_better_than_another(rigid_box):
     # three frames a toss; of a Gaussian as wide as the truth the score is half the mean distance
     assert found[0] / (12 * 3) == pytest.approx(0.5, abs=0.15)
     assert MEMBERS == 24
+
+
+def test_rollouts_under_a_law_without_rebound_are_those_without_a_law(box_body, simulated_tosses):
+    """Over the flight and the first impacts; then points below the plane, which a law does not push out, differ."""
+    tosses = simulated_tosses(4)
+    start = Start(
+        np.stack([t.rotation[0] for t in tosses]),
+        np.stack([t.position_m[0] for t in tosses]),
+        np.tile([1.0, -2.0, 0.5], (4, 1)),
+        np.tile([0.5, 0.2, -0.3], (4, 1)),
+    )
+    plain = simulate(box_body, 8, start, 160, 1 / 592)
+    lawful = simulate_law(box_body, 8, Law(float(box_body.friction), 0.0, 0.1), start, 40, 4 / 592)
+    assert lawful.failures == 0
+    np.testing.assert_allclose(lawful.position_m[:, :24], plain.position_m[:, 3:96:4], atol=6e-3)
+    np.testing.assert_allclose(lawful.rotation[:, :24], plain.rotation[:, 3:96:4], atol=0.1)
+    np.testing.assert_allclose(lawful.position_m[:, 0], plain.position_m[:, 3], atol=1e-9)

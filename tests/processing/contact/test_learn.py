@@ -7,15 +7,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from processing.contact.evaluate import evaluate, summarise
-from processing.contact.fit import Fit, FitConfig, Model
-from processing.contact.geometry import Box, FreePoints, hull_mesh, hull_of, sphere
+from processing.contact.fit import Fit, FitConfig, Model, fit
+from processing.contact.geometry import SCALE_M, Box, FreePoints, hull_mesh, hull_of, sphere
 from processing.contact.inertia import inertia_from, known_physics, physics_of_session, uniform_physics
 from processing.contact.intervals import Interval
 from processing.contact.learn import ContactConfig, learn_contact
-from processing.contact.loss import Weights
+from processing.contact.loss import StepData, Weights
 from processing.contact.motion import PoseSeries, rotation_matrices
 from processing.contact.pieces import carried, convex_pieces
 from processing.contact.plane import Plane
+from processing.contact.prepared import prepare, transitions
 from processing.contact.prior import prior_from_shape, prior_from_size
 from processing.contact.weights import Candidate, choose
 from recordings.errors import BadInput
@@ -288,3 +289,42 @@ def test_tosses_at_30_hz_with_noise_are_learned_from(simulated_tosses, box_physi
     assert learning.friction.value == pytest.approx(0.25, abs=0.06)
     np.testing.assert_allclose([e.value for e in learning.extents], TRUE_EDGES_M, atol=0.006)
     assert learning.sweep is not None
+
+
+class InflatedGrid:
+    """A shape kept as a signed distance on a grid: its surface points, moved along the gradient by one learned
+    offset."""
+
+    name, contacts = "nonconvex", 8
+
+    def __init__(self, half_m, too_big_m):
+        axes = [np.linspace(-h - 0.01, h + 0.01, 21) for h in half_m]
+        grid = np.stack(np.meshgrid(*axes, indexing="ij"), -1)
+        beyond = np.abs(grid) - half_m
+        distance = np.linalg.norm(np.maximum(beyond, 0), axis=-1) + np.minimum(beyond.max(-1), 0)
+        slope = np.stack(np.gradient(distance, *axes), -1)
+        near = np.abs(distance) < 0.008
+        normal = slope[near] / np.linalg.norm(slope[near], axis=-1, keepdims=True)
+        self.surface_m, self.normal = grid[near] - distance[near][:, None] * normal, normal
+        self.too_big_m = too_big_m
+
+    def start(self):
+        return np.array([self.too_big_m / SCALE_M])
+
+    def points(self, parameters):
+        surface, normal = (torch.as_tensor(a, dtype=parameters.dtype) for a in (self.surface_m, self.normal))
+        return surface + SCALE_M * parameters[0] * normal
+
+    def pieces(self):
+        return (tuple(range(len(self.surface_m))),)
+
+
+def test_a_signed_distance_grid_can_stand_behind_the_geometry(simulated_tosses, box_physics):
+    """Against a plane a body touches with points: any shape that offers them, as its grid's surface does, is fitted."""
+    prior = prior_from_size("box", 0.08)
+    prepared = prepare(simulated_tosses(4), prior.frame, Plane(), box_physics.inertia_kgm2)
+    model = Model(InflatedGrid(np.array([0.05, 0.04, 0.03]), 0.004), box_physics.inertia_kgm2, FitConfig())
+    data = StepData(transitions(prepared))
+    found = fit(model, model.start(), data, Weights(dissipation=30.0), 0.5)
+    assert found.parameters[0] * SCALE_M == pytest.approx(0.0, abs=1.5e-3)
+    assert found.parameters[-11] ** 2 == pytest.approx(0.25, abs=0.06)
