@@ -13,13 +13,14 @@ hardly two pixels wide, a fit of the outline is drawn inwards or outwards by the
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 from numpy import ndarray as Array
+from scipy import fft
 
 DICTIONARIES = {
     "tag36h11": (cv2.aruco.DICT_APRILTAG_36H11, 8),
@@ -37,6 +38,8 @@ START_VARIANCE_PX2 = 0.35
 LEAST_VARIANCE_PX2, LARGEST_VARIANCE_PX2 = 0.05, 9.0
 WIDEST_BLUR = 0.8
 """A blur wider than this share of a cell leaves nothing of the pattern."""
+SAME_BLUR = 0.1
+"""A pattern drawn with a variance this near (relatively) is not drawn anew: its derivative by the blur does."""
 LARGEST_SPILL_PX = 1.0
 LARGEST_SHIFT_PX = 0.6
 """A corner that moves further from where the outline has it was not found (or a third of a cell)."""
@@ -101,7 +104,7 @@ class _Pattern:
         reach = np.linalg.norm(cells_from_px, axis=1)
         wanted = [blurred, 1j * across * blurred, 1j * down * blurred, -power * blurred]
         wanted.append((reach[0] * upright + reach[1] * level) * blur)
-        return [np.fft.irfft2(s, (self.size, self.size)).astype(np.float32) for s in wanted]
+        return [fft.irfft2(s.astype(np.complex64), (self.size, self.size)) for s in wanted]
 
     def sampled(self, maps: list[Float32[Array, "s s"]], places: Float[Array, "n 2"]) -> Float[Array, "m n"]:
         """The maps at places in cells."""
@@ -138,6 +141,8 @@ class _State:
     variance_px2: float
     spill_px: float
     light: Float[Array, "6"] | None = None
+    maps: list[Float32[Array, "s s"]] = field(default_factory=list)
+    drawn_with_px2: float = np.nan
 
 
 def _fit(
@@ -195,8 +200,11 @@ def _step(
     """One step of Gauss-Newton, in place; the normal matrix, residuals, weights and contrast before it."""
     half = pattern.cells / 2
     places = _moved(state.cells_from_px, pixels)
-    local = _local(state.cells_from_px, _corners(pattern, state).mean(axis=0))
-    B, across, down, wider, spilled = pattern.sampled(pattern.maps(local, state.variance_px2), places)
+    if not abs(state.variance_px2 / state.drawn_with_px2 - 1) < SAME_BLUR:
+        local = _local(state.cells_from_px, _corners(pattern, state).mean(axis=0))
+        state.maps, state.drawn_with_px2 = pattern.maps(local, state.variance_px2), state.variance_px2
+    B, across, down, wider, spilled = pattern.sampled(state.maps, places)
+    B = B + (state.variance_px2 - state.drawn_with_px2) * wider
     B = B + state.spill_px * spilled
     u, v = ((places - half) / half).T
     ramp = np.stack([np.ones_like(u), u, v], 1)
