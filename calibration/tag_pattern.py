@@ -33,6 +33,8 @@ MARGIN = 2
 LOOK = 0.9
 TEXELS = (8, 16, 32)
 TEXELS_PER_PX = 2.0
+MOST_PIXELS = 8000
+"""Of a larger tag every second, third, ... is looked at (OpenCV's remap takes no more than 32767 at a time)."""
 STEPS = 6
 START_VARIANCE_PX2 = 0.35
 LEAST_VARIANCE_PX2, LARGEST_VARIANCE_PX2 = 0.05, 9.0
@@ -190,7 +192,8 @@ def _around(
     x, y = np.meshgrid(np.arange(low[0], high[0]), np.arange(low[1], high[1]))
     places = _moved(cells_from_px, np.stack([x.ravel(), y.ravel()], -1).astype(np.float64))
     inside = ((places > -LOOK) & (places < cells + LOOK)).all(axis=1)
-    u, v = x.ravel()[inside], y.ravel()[inside]
+    every = max(1, int(np.ceil(inside.sum() / MOST_PIXELS)))
+    u, v = x.ravel()[inside][::every], y.ravel()[inside][::every]
     return np.stack([u, v], -1).astype(np.float64), image[v, u].astype(np.float64)
 
 

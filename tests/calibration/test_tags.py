@@ -87,6 +87,12 @@ def test_the_whole_pattern_tells_corners_where_cells_are_small_and_where_light_s
     assert np.sqrt((whole**2).mean()) < 0.08 < 0.3 < np.sqrt((outline**2).mean())
 
 
+def test_a_tag_that_fills_the_picture_is_fitted_too():
+    gaps, _ = errors([drawn(3, 320.0, 3)], refinement="pattern")
+    assert len(gaps) == 1
+    assert np.sqrt((gaps**2).mean()) < 0.1
+
+
 @pytest.mark.slow
 def test_fitted_edges_beat_the_detector_in_sharp_and_in_blurred_pictures():
     child = DetectorChild("tag36h11", 1.0)
