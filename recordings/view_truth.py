@@ -23,6 +23,7 @@ LEFT_GAIN = 200.0
 """Arrows of what is left are drawn this many times longer."""
 SIGMAS = 30.0
 """Ellipsoids are drawn at this many standard deviations: three would not be seen."""
+SAID_ABOVE_M = 0.09
 TAGS, CAMERAS, PATH = "truth_tags", "world/path/truth_cameras", "world/path/truth_sigma"
 
 
@@ -67,9 +68,12 @@ def log_cameras(clock: Clock, scene: Scene, cameras: dict[str, Any]) -> None:
     """Where the solution has the cameras, as ellipsoids of their uncertainty."""
     poses = np.array([c["world_from_camera"] for c in cameras.values()], dtype=np.float64).reshape(-1, 4, 4)
     covariances = np.array([c["covariance"] for c in cameras.values()], dtype=np.float64).reshape(-1, 6, 6)
-    labels = [f"{name} {1000 * np.sqrt(np.trace(C[3:, 3:])):.1f} mm" for name, C in zip(cameras, covariances)]
-    start_ns = scene.spans_ns[clock.toss][0]
-    clock.at(start_ns).log(CAMERAS, ellipsoids(poses, covariances, labels))
+    labels = [f"+-{1000 * np.sqrt(np.trace(C[3:, 3:])):.2f} mm" for C in covariances]
+    at = clock.at(scene.spans_ns[clock.toss][0])
+    at.log(CAMERAS, ellipsoids(poses, covariances))
+    # above the camera: its name stands beside it already
+    above = poses[:, :3, 3] + np.array([0.0, 0.0, SAID_ABOVE_M])
+    at.log(f"{CAMERAS}/said", rr.Points3D(above, labels=labels, colors=[SIGMA_COLOR], radii=0.0005))
 
 
 def log_path_sigma(clock: Clock, scene: Scene, data: dict[str, Array]) -> None:
@@ -77,13 +81,11 @@ def log_path_sigma(clock: Clock, scene: Scene, data: dict[str, Array]) -> None:
     if len(data["track_time_ns"]) == 0:
         return
     start_ns = scene.spans_ns[clock.toss][0]
-    drawn = ellipsoids(data["track_world_from_tagged"], data["track_covariance"], None)
+    drawn = ellipsoids(data["track_world_from_tagged"], data["track_covariance"])
     clock.at(start_ns).log(PATH, drawn)
 
 
-def ellipsoids(
-    poses: Float[Array, "n 4 4"], covariances: Float[Array, "n 6 6"], labels: list[str] | None
-) -> rr.Ellipsoids3D:
+def ellipsoids(poses: Float[Array, "n 4 4"], covariances: Float[Array, "n 6 6"]) -> rr.Ellipsoids3D:
     """SIGMAS standard deviations of the translation part (each covariance is in its pose's own frame)."""
     values, vectors = np.linalg.eigh(covariances[:, 3:, 3:])
     turns = poses[:, :3, :3] @ vectors
@@ -94,6 +96,5 @@ def ellipsoids(
         half_sizes=SIGMAS * np.sqrt(np.maximum(values, 0.0)),
         quaternions=wxyz[:, [1, 2, 3, 0]],
         colors=[SIGMA_COLOR],
-        labels=labels,
         line_radii=-0.7,
     )
