@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from recordings.session import Session
     from recordings.tracks import ObjectShape, ObjectTrack
 
-STAGE, VERSION = "contact-only", 2
+STAGE, VERSION = "contact-only", 3
 CAMERA = "d455"
 DEFAULT_STEPS = 80
 MOST_TOSSES_LEARNED = 64
@@ -148,15 +148,18 @@ def find_poses(
             "wanted a tracked "
             "session: run `toss-process SESSION` first, or import poses with `toss-session import contactnets`"
         )
-    name = "/track/pose" + ("" if poses is None else f" (there is no track of vision in {out_dir})")
-    return PoseSource(name, [PoseSeries.from_poses(t, p) for t, p in found.items()], None)
+    note = (
+        None if poses is None else f"--poses track: no track of vision in {out_dir}; the poses on /track/pose were used"
+    )
+    return PoseSource("/track/pose", [PoseSeries.from_poses(t, p) for t, p in found.items()], None, note)
 
 
 class PoseSource:
-    """Where poses came from, the poses, and the shape in their object frame where there is one."""
+    """Where poses came from, the poses, the shape in their object frame where there is one, and what a reader should
+    know of them."""
 
-    def __init__(self, name: str, tracks: list[PoseSeries], shape: ObjectShape | None) -> None:
-        self.name, self.tracks, self.shape = name, tracks, shape
+    def __init__(self, name: str, tracks: list[PoseSeries], shape: ObjectShape | None, note: str | None = None) -> None:
+        self.name, self.tracks, self.shape, self.note = name, tracks, shape, note
 
 
 def _truth_poses(session: Session, tosses: Sequence[int], given: Path | None, vision: PoseSource | None) -> PoseSource:

@@ -78,7 +78,7 @@ def run_stage(
     def compute(folder: Path) -> Mapping[str, Any]:
         learning, shape, extra = _learn(train, geometry, init_m, source, given, plane, config, progress)
         evaluation = evaluate(learning, [tracks[t] for t in tested], plane, steps, STEP_S, "thrown")
-        document, more = result_document(learning, evaluation), [*_unmeasured(geometry, source), *_cut(wanted, steps)]
+        document, more = result_document(learning, evaluation), _warnings(geometry, source, wanted, steps)
         document |= {
             "session": session.name,
             "poses": source.name,
@@ -101,6 +101,7 @@ def run_stage(
         "geometry": geometry or "from the data",
         "init_m": init_m,
         "steps": steps,
+        "steps_wanted": wanted,
         "device": device,
     }
     done = Store(out_dir).run(
@@ -206,6 +207,11 @@ def _cut(wanted: int, steps: int) -> list[str]:
     return [f"--steps {wanted}: no toss lasts that long; rolled out over {steps} steps, to the end of the longest one"]
 
 
+def _warnings(geometry: str | None, source: PoseSource, wanted: int, steps: int) -> list[str]:
+    noted = [] if source.note is None else [source.note]
+    return [*noted, *_unmeasured(geometry, source), *_cut(wanted, steps)]
+
+
 def _unmeasured(geometry: str | None, source: PoseSource) -> list[str]:
     if geometry != "nonconvex" or source.shape is not None:
         return []
@@ -222,7 +228,7 @@ def session_plane(session: Session) -> Plane:
 
 def _about(source: PoseSource, given: Physics | None, plane: Plane) -> str:
     """Fingerprint of what else decides the result: where the poses come from, the shape, the physics, the plane."""
-    content = hashlib.sha256(source.name.encode())
+    content = hashlib.sha256(f"{source.name} {source.note is None}".encode())
     values = [plane.normal_world, np.array([plane.offset_m, plane.std_m or 0.0])]
     if source.shape is not None:
         values += [source.shape.vertices_m, source.shape.faces]
