@@ -38,6 +38,8 @@ class ChartConfig:
     """Of the pixels, one in so many tells what the light does."""
     robust: float = 1.5
     """Residuals of the light beyond so many standard deviations belong to the object."""
+    shine: float = 0.2
+    """A surface whose brightness is beyond the light's by this share, and its colour paler, mirrors a lamp."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,9 +88,10 @@ def charts_of(
     for n, (i, p) in enumerate(zip(views, seen)):
         cell = np.floor((p.angle + np.pi) / (2 * np.pi) * cells).astype(int) % cells
         row = _rows(p, profile, low, high, ends, config)
-        use = row >= 0
+        left, shines = looks[n]
+        use = (row >= 0) & ~shines
         np.add.at(count[n], (row[use], cell[use]), 1)
-        np.add.at(mean[n], (row[use], cell[use]), looks[n][use])
+        np.add.at(mean[n], (row[use], cell[use]), left[use])
         height, layer, side, off = _off(p, profile, low, config)
         np.add.at(odd[n], (side[off], layer[off] * heights + height[off], cell[off]), 1)
         free[n] = _free(scene, int(i), poses[i], axis, profile, low, cells, config)
@@ -136,16 +139,21 @@ def _light(normal: Float[Array, "p 3"], bright: Float[Array, " p"]) -> Float[Arr
     return np.stack([*first, *third, z * (5 * z * z - 3), bright], -1)
 
 
-def _without_light(seen: list[_Pixels], config: ChartConfig) -> list[Float[Array, "p 2"]]:
-    """Colours less what the light does to them, fitted robustly over all views: camera and room stand still."""
+def _without_light(seen: list[_Pixels], config: ChartConfig) -> list[tuple[Float[Array, "p 2"], Bool[Array, " p"]]]:
+    """Colours less what the light does to them, fitted robustly over all views (camera and room stand still), and where
+    a lamp is mirrored."""
     some = [np.flatnonzero(p.facing > config.facing)[:: config.lit_every] for p in seen]
     normal = np.concatenate([p.normal_camera[g] for p, g in zip(seen, some)])
     bright = np.concatenate([p.bright[g] for p, g in zip(seen, some)])
     terms = _light(normal, bright - bright.mean())
     stiff = 2e-5 * len(terms) * np.diag([0.0] + [1.0] * (terms.shape[1] - 1))
-    out = [p.looks.copy() for p in seen]
-    for c in range(2):
-        wanted = np.concatenate([p.looks[g, c] for p, g in zip(seen, some)])
+    out = [np.column_stack([p.looks, p.bright - bright.mean()]) for p in seen]
+    terms_of = [_light(p.normal_camera, p.bright - bright.mean()) for p in seen]
+    for c in range(3):
+        wanted = np.concatenate([o[g, c] for o, g in zip(out, some)])
+        if c == 2:  # brightness is not told by itself
+            terms = terms[:, :-1]
+            stiff = stiff[:-1, :-1]
         weight = np.ones(len(terms))
         for _ in range(8):
             weighed = terms * weight[:, None]
@@ -153,9 +161,17 @@ def _without_light(seen: list[_Pixels], config: ChartConfig) -> list[Float[Array
             left = wanted - terms @ of_light
             scale = config.robust * 1.48 * np.median(np.abs(left)) + 1e-6
             weight = 1.0 / (1.0 + (left / scale) ** 2) ** 2
-        for o, p in zip(out, seen):
-            o[:, c] -= _light(p.normal_camera, p.bright - bright.mean()) @ of_light
-    return out
+        for o, t in zip(out, terms_of):
+            o[:, c] -= t[:, : terms.shape[1]] @ of_light
+    usual = np.median(np.concatenate([p.looks[g] for p, g in zip(seen, some)]), axis=0)
+    return [(o[:, :2], _shines(o, usual, config)) for o in out]
+
+
+def _shines(left: Float[Array, "p 3"], usual: Float[Array, "2"], config: ChartConfig) -> Bool[Array, " p"]:
+    """Where a lamp is mirrored: brighter than the light makes it, and its colour on the way to the lamp's (grey)."""
+    size = np.linalg.norm(left[:, :2], axis=1) * np.linalg.norm(usual) + 1e-9
+    paler = -(left[:, :2] @ usual) > 0.9 * size
+    return np.asarray((left[:, 2] > config.shine) & paler)
 
 
 def _profile(seen: list[_Pixels], low: float, high: float, config: ChartConfig) -> Float[Array, " h"]:

@@ -15,7 +15,7 @@ from processing.track.graph import GraphConfig, Motion, Refined, refine, steady_
 from processing.track.middle import center_of_mass
 from processing.track.motion import MotionConfig, change_cost, turn_between
 from processing.track.round_axis import Axis, open_axis
-from processing.track.turns import TurnConfig, Turned, contradiction, doubted, steady, turned
+from processing.track.turns import TurnConfig, Turned, contradiction, doubted, turned
 
 
 @dataclass(frozen=True)
@@ -80,14 +80,10 @@ def _sought(scene: Scene, stories: list[Story], first: int, keep_first: bool, co
     if len(stories) == 1 and apart_deg(best.joint.poses[:n], found.poses) < config.agreeing_deg:
         return None
     told, easy = replace(best.told, poses=found.poses), replace(config, graph=config.round_body)
-    # places and tilts had followed the wrong turns; with better ones the turns are told better
-    once = refined(scene, told, first, keep_first, easy, axis)
-    found = steady(scene, replace(found, poses=once.joint.poses[:n]), once.use, first, config.turns)
-    told = replace(best.told, poses=found.poses)
     both = [refined(scene, told, first, keep_first, easy, a) for a in (axis, None)]
-    held, free = (contradiction(scene, s.joint.poses[:n], s.use, axis, config.turns) for s in both)
+    held, free = (contradiction(scene, s.joint.poses[:n], s.use, found, config.turns) for s in both)
     kept, said = (both[1], free) if free < config.freed * held else (both[0], held)
-    if len(stories) == 1 and contradiction(scene, best.joint.poses[:n], best.use, axis, config.turns) < said:
+    if len(stories) == 1 and contradiction(scene, best.joint.poses[:n], best.use, found, config.turns) < said:
         return None
     return replace(kept, turned=doubted(found, said, first, config.turns))
 

@@ -57,8 +57,14 @@ class TurnConfig:
     pair_dead: float = 2.0
     fine_dead: float = 0.5
     """A pair's looks below this are the light's."""
-    most: float = 6.0
-    """A pair's word counts no more than this."""
+    most_looks: float = 6.0
+    most_shape: float = 10.0
+    """A pair's word counts no more than this: highlights look like labels, but nothing looks like a handle."""
+    left: float = 0.25
+    """Mean of a pair's looks that even the best turns contradict; where more is left, looks stay with the room (a
+    lamp's mirror images, shadows) and count the less."""
+    trusted: float = 0.7
+    """Looks that count less than this make the search start again."""
     spin_change_rad_s: float = 1.5
     """Usual change of spin from view to view, on the grid."""
     flight_price: float = 4.0
@@ -66,13 +72,13 @@ class TurnConfig:
     flight_m_s: float = 0.15
     """A change of velocity, beyond gravity's, below this is free flight."""
     fast_rad_s: float = 25.0
-    fast_price: float = 20.0
+    fast_price: float = 100.0
     """Spins above this cost their excess times this."""
     sweeps: int = 8
     longest: int = 12
     """Views of a run that is turned together."""
     rounds: int = 2
-    least_sigma_deg: float = 3.0
+    least_sigma_deg: float = 4.0
     """What shading and the depth sensor's fixed pattern make a found turn err by, however sure the pairs are."""
     usual: float = 0.5
     """Contradiction that right poses leave; where more is left, something is wrong and doubt grows with it."""
@@ -85,6 +91,8 @@ class Turned:
     poses: Float[Array, "n 4 4"]
     sigma_rad: Float[Array, " n"]
     axis: Axis
+    trust: float = 1.0
+    """How much looks were believed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,13 +113,14 @@ def doubted(found: Turned, said: float, first: int, config: TurnConfig) -> Turne
 
 
 def contradiction(
-    scene: Scene, poses: Float[Array, "n 4 4"], use: Bool[Array, " n"], axis: Axis, config: TurnConfig
+    scene: Scene, poses: Float[Array, "n 4 4"], use: Bool[Array, " n"], found: Turned, config: TurnConfig
 ) -> float:
-    """What the pairs of views that the search compares say against these poses, mean over pairs."""
+    """What the pairs of views that the search compares say against these poses, mean over pairs, looks as much believed
+    as in `found`."""
     frames = _frames(scene, use, config)
     if len(frames.pairs) == 0:
         return 0.0
-    costs, _ = _fine_costs(scene, poses, frames, axis, config)
+    costs, _ = _fine_costs(scene, poses, frames, found.axis, found.trust, config)
     return float(costs[:, config.fine_reach].mean())
 
 
@@ -128,24 +137,42 @@ def turned(
     charts = charts_of(scene, poses, frames.views, axis, config.cells, config.chart)
     pace = _pace(scene, poses, frames, axis, config)
     looks, shape = _said(charts, frames.pairs, config.cells // 2, None, config)
-    looks = np.maximum(_above_least(looks) - config.pair_dead, 0.0)
-    costs = _cyclic(looks - shape, config.cells)
-    # a cell more or less: turns are rounded to the grid
-    costs = np.minimum(np.minimum(np.roll(costs, 1, 1), costs), np.roll(costs, -1, 1))
-    costs = np.minimum(_above_least(costs), config.most)
+    looks, shape = (_cyclic(c, config.cells) for c in (looks, -shape))
+    looks = np.minimum(np.maximum(_above_least(looks) - config.pair_dead, 0.0), config.most_looks)
+    shape = np.minimum(_above_least(shape), config.most_shape)
     motion = np.array([config.spin_change_rad_s, config.fast_rad_s, config.fast_price])
-    given = (costs, frames.pairs, pace.base_rad, pace.steps_s, pace.still, pace.price, step, motion)
-    starts = [np.zeros(len(frames.views), dtype=np.int64), tk.greedy(len(frames.views), *given)]
+    rest = (frames.pairs, pace.base_rad, pace.steps_s, pace.still, pace.price, step, motion)
+    starts = [np.zeros(len(frames.views), dtype=np.int64)]
     starts += [np.round(_angles(poses[frames.views], r[frames.views], axis) / step).astype(np.int64) % config.cells
                for r in rivals]  # fmt: skip
-    found = [tk.settle(s, *given, config.sweeps, config.longest) for s in starts]
-    state = min(found, key=lambda s: float(tk.energy(s, *given)))
-    sigma = np.sqrt(tk.spreads(state, *given))
+    state, trust = _sought(_near(looks, shape), rest, starts, config), 1.0
+    between = (state[frames.pairs[:, 0]] - state[frames.pairs[:, 1]]) % config.cells
+    left = float(_near(looks, np.zeros_like(looks))[np.arange(len(looks)), between].mean())
+    if 1 / (1 + (left / config.left) ** 2) < config.trusted:
+        trust = 1 / (1 + (left / config.left) ** 2)
+        state = _sought(_near(trust * looks, shape), rest, [*starts, state], config)
+    sigma = np.sqrt(tk.spreads(state, _near(trust * looks, shape), *rest))
     out = _moved(poses, frames, state * step, axis, first)
     spread = np.zeros(len(poses))
     for run, s in zip(frames.runs, sigma):
         spread[run] = s
-    return steady(scene, Turned(out, spread, axis), use, first, config)
+    return steady(scene, Turned(out, spread, axis, trust), use, first, config)
+
+
+def _near(looks: Float[Array, "m c"], shape: Float[Array, "m c"]) -> Float[Array, "m c"]:
+    """Costs of a cell more or less: turns are rounded to the grid."""
+    costs = looks + shape
+    return _above_least(np.minimum(np.minimum(np.roll(costs, 1, 1), costs), np.roll(costs, -1, 1)))
+
+
+def _sought(
+    costs: Float[Array, "m c"], rest: tuple[object, ...], starts: list[Int[Array, " v"]], config: TurnConfig
+) -> Int[Array, " v"]:
+    """The turns (cells) that cost least, from several starts."""
+    starts = [*starts, tk.greedy(len(starts[0]), costs, *rest)]
+    found = [tk.settle(s.copy(), costs, *rest, config.sweeps, config.longest) for s in starts]
+    best: Int[Array, " v"] = min(found, key=lambda s: float(tk.energy(s, costs, *rest)))
+    return best
 
 
 def steady(scene: Scene, found: Turned, use: Bool[Array, " n"], first: int, config: TurnConfig) -> Turned:
@@ -155,7 +182,7 @@ def steady(scene: Scene, found: Turned, use: Bool[Array, " n"], first: int, conf
     if len(frames.pairs) == 0:
         return found
     for _ in range(config.rounds):
-        costs, cell_rad = _fine_costs(scene, poses, frames, found.axis, config)
+        costs, cell_rad = _fine_costs(scene, poses, frames, found.axis, found.trust, config)
         pace = _pace(scene, poses, frames, found.axis, config)
         start = _run_of(frames.runs, first)
         angle, sigma = steadied(costs, frames.pairs, pace, cell_rad, start, config.steady)
@@ -178,7 +205,7 @@ def _moved(
 
 
 def _fine_costs(
-    scene: Scene, poses: Float[Array, "n 4 4"], frames: _Frames, axis: Axis, config: TurnConfig
+    scene: Scene, poses: Float[Array, "n 4 4"], frames: _Frames, axis: Axis, trust: float, config: TurnConfig
 ) -> tuple[Float[Array, "m d"], float]:
     """What each pair says against turns near those of the poses, in fine cells, and a cell's angle."""
     charts = charts_of(scene, poses, frames.views, axis, config.fine_cells, config.chart)
@@ -186,8 +213,8 @@ def _fine_costs(
     share = config.cells / config.fine_cells  # more cells, as many witnesses
     looks, shape = _said(charts, frames.pairs, config.fine_reach, here, config)
     looks, shape = _above_least(share * looks), _above_least(-share * shape)
-    costs = np.minimum(np.maximum(looks - config.fine_dead, 0.0) + shape, config.most)
-    return costs, 2 * np.pi / config.fine_cells
+    looks = np.minimum(np.maximum(looks - config.fine_dead, 0.0), config.most_looks)
+    return trust * looks + np.minimum(shape, config.most_shape), 2 * np.pi / config.fine_cells
 
 
 def _said(
