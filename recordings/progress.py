@@ -48,16 +48,19 @@ class Console:
         self._every_s = 0.2 if self._stream.isatty() else 10.0
         self._started_s = time.monotonic()
         self._shown_s: float | None = None
+        self._begun: tuple[int, float] | None = None
+        """The first step that was told, and when: what came before it (loading, compiling) is not part of the pace."""
 
     def step(self, done: int, total: int, note: str = "") -> None:
         now = time.monotonic()
+        self._begun = self._begun or (done, now)
         elapsed = now - self._started_s
         last = done >= total
         due = self._shown_s is None or now - self._shown_s >= self._every_s or last
         if elapsed < self.FIRST_SHOWN_S or not due:
             return
         self._shown_s = now
-        estimate = "" if last or done == 0 else f", about {elapsed / done * (total - done):.0f} s left"
+        estimate = "" if last else self._estimate(done, total, now)
         text = f"{self._label}: {done}/{total} {note} ({elapsed:.0f} s{estimate})"
         if self._stream.isatty():
             text = f"\r\x1b[K{text}" + ("\n" if last else "")
@@ -68,3 +71,10 @@ class Console:
 
     def value(self, name: str, value: float, *, at: int) -> None:
         pass
+
+    def _estimate(self, done: int, total: int, now: float) -> str:
+        """How long the rest takes at the pace since the first step (or since the beginning, where steps are big)."""
+        first, begun_s = self._begun or (done, now)
+        if done == first:
+            first, begun_s = 0, self._started_s
+        return f", about {(now - begun_s) / (done - first) * (total - done):.0f} s left" if done > 1 else ""

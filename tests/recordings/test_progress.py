@@ -36,6 +36,16 @@ def test_longer_work_says_how_far_and_how_long_still(clock):
     assert out.getvalue() == "track: 10/40 toss 3 (5 s, about 15 s left)\n"
 
 
+def test_what_comes_before_the_first_step_is_not_taken_for_the_pace(clock):
+    out = io.StringIO()
+    console = progress.Console("field", out)
+    clock[0] += 5  # loading, compiling
+    console.step(1, 101)
+    clock[0] += 10
+    console.step(11, 101)
+    assert out.getvalue() == "field: 1/101  (5 s)\nfield: 11/101  (15 s, about 90 s left)\n"
+
+
 def test_a_log_file_gets_few_lines_and_the_last_one_always(clock):
     out = io.StringIO()
     console = progress.Console("track", out)
