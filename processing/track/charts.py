@@ -30,7 +30,7 @@ class ChartConfig:
     """What is farther from the axis than the round body by this stands off it."""
     beyond_m: float = 0.012
     """A place is empty where the surface behind it is farther by this ..."""
-    beside_px: float = 1.5
+    beside_px: float = 4.5
     """... or where the outline passes it by this."""
     facing: float = 0.25
     """Looks of a surface that turns away from the camera farther than this cosine are not used."""
