@@ -19,10 +19,12 @@ class AxisConfig:
 
     round_ratio: float = 0.2
     """A turn about which depth tells less than this share of what it tells about the next is open ..."""
-    round_share: float = 0.7
+    round_share: float = 0.6
     """... where so many normals meet the axis ..."""
     round_cells: int = 14
-    """... and point in so many of 36 directions around it (a box's point in four)."""
+    """... and point in so many of 36 directions around it (a box's point in four) ..."""
+    round_both: float = 9.8
+    """... and both together (their product) say so: noisy normals that miss the axis are made up for by directions."""
     meets: float = 0.1
     """A normal that passes the axis by less than this share of the body's size meets it."""
     facing: float = 0.5
@@ -69,9 +71,10 @@ def open_axis(scene: Scene, poses: Float[Array, "n 4 4"], use: Bool[Array, " n"]
         gap = lever @ np.concatenate([shift, direction])
         weight = 1.0 / (1.0 + (gap / config.meets) ** 2) ** 2
     meeting = np.abs(gap) < 2 * config.meets
-    if told[0] > config.round_ratio * told[1] or meeting.mean() < config.round_share:
+    share, cells = float(meeting.mean()), _directions_around(normals[meeting], direction)
+    if told[0] > config.round_ratio * told[1] or share < config.round_share or cells < config.round_cells:
         return None
-    if _directions_around(normals[meeting], direction) < config.round_cells:
+    if share * cells < config.round_both:
         return None
     return Axis(direction, _foot(middle + size * np.cross(direction, shift), direction))
 
