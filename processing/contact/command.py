@@ -12,12 +12,13 @@ from typing import TYPE_CHECKING, Any
 from recordings.console import Outcome
 from recordings.errors import BadInput
 from recordings.progress import Progress, Silent
+from recordings.tracks import ObjectTrack
 
 if TYPE_CHECKING:
     from processing.contact.motion import PoseSeries
     from processing.truth import Truth
     from recordings.session import Session
-    from recordings.tracks import ObjectShape, ObjectTrack
+    from recordings.tracks import ObjectShape
 
 STAGE, VERSION = "contact-only", 3
 CAMERA = "d455"

@@ -95,6 +95,14 @@ def test_bad_arguments_say_what_was_wanted(poses_session, tmp_path, options, wor
         contact_only(poses_session, tmp_path / "out", **options)
 
 
+def test_true_poses_of_a_session_with_cameras_come_from_its_truth_folder(tmp_path):
+    sample = Session.open(Path(__file__).parents[3] / "recordings" / "samples" / "box_toss")
+    source = find_poses(sample, tmp_path, "truth", [0, 1])
+    assert [t.toss for t in source.tracks] == [0, 1]
+    assert source.name.startswith("truth")
+    assert all(np.isfinite(t.position_m).all() and t.position_m[:, 2].min() > -0.02 for t in source.tracks)
+
+
 def test_cuda_is_refused_where_there_is_none(poses_session, tmp_path):
     if torch.cuda.is_available():
         pytest.skip("there is a CUDA device")
