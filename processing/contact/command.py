@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from recordings.session import Session
     from recordings.tracks import ObjectShape
 
-STAGE, VERSION = "contact-only", 3
+STAGE, VERSION = "contact-only", 4
 CAMERA = "d455"
 DEFAULT_STEPS = 80
 MOST_TOSSES_LEARNED = 64

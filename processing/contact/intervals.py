@@ -192,29 +192,3 @@ def plane_sensitivity(
         "largest_extent_m_per_m": float(change[np.abs(change).argmax()]),
         "friction_per_m": friction,
     }
-
-
-PLANES_M = np.array([-0.01, -0.005, 0.0, 0.005, 0.01])
-
-
-def plane_by_loss(fitted: Model, optimum: Float[Array, " p"], data: StepData, weights: Weights) -> float | None:
-    """How much higher (m) the plane lies by which a box fits best: resting on a face tells half its edge plus the
-    plane's height, striking with a corner sqrt(3) times that half plus the height. Within PLANES_M; None for other
-    shapes, whose points are all free.
-
-    It is too coarse to learn from (a rebound or a soft contact moves it), but it shows a plane that is far off.
-    """
-    if fitted.geometry.name != "box" or not fitted.config.learn_shape:
-        return None
-    losses = []
-    for height_m in PLANES_M:
-        low = data.rows(torch.arange(len(data), device=data.weight.device))
-        low.position_m = data.position_m - data.position_m.new_tensor([0.0, 0.0, height_m])
-        start = optimum.copy()
-        start[SHAPE] = np.maximum(np.abs(start[SHAPE]) - height_m / SCALE_M, 0.02)
-        losses.append(fit(fitted, start, low, weights, 0.3).loss)
-    i = int(np.clip(np.argmin(losses), 1, len(losses) - 2))
-    before, here, after = losses[i - 1 : i + 2]
-    bend = before + after - 2 * here
-    move = 0.5 * (before - after) / bend if bend > 0 else 0.0
-    return float(PLANES_M[i] + np.clip(move, -1, 1) * (PLANES_M[1] - PLANES_M[0]))

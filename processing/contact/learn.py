@@ -23,7 +23,6 @@ from processing.contact.intervals import (
     bootstrap,
     curvature,
     extents,
-    plane_by_loss,
     plane_sensitivity,
 )
 from processing.contact.loss import REFERENCE_MASS_KG, Body, StepData, Weights, contact_loss
@@ -31,6 +30,7 @@ from processing.contact.motion import PoseSeries, Steps
 from processing.contact.plane import Plane
 from processing.contact.prepared import Prepared, no_contact, prepare, starts, transitions
 from processing.contact.prior import Frame, Prior, learned_shape
+from processing.contact.touch import plane_by_touch
 from processing.contact.unexplained import unexplained_rows
 from processing.contact.weights import HeldOut, Sweep, SweepConfig, sweep_weights
 from recordings.progress import Progress, Silent
@@ -143,8 +143,6 @@ def learn_contact(
     spread = _spread(fitted, optimum, data, weights, config, len(prepared.tracks))
     progress.step(4, 6, "intervals")
     sensitivity = plane_sensitivity(fitted, optimum, data, weights)
-    if not frames_are_slow(prepared.tracks) and len(prepared.tracks) > 2:
-        found["plane_by_loss_m"] = plane_by_loss(fitted, optimum, data, weights)
     progress.step(5, 6, "sensitivity")
     last, spread = with_friction(fits[-1], spread, slow)
     optimum = last.parameters
@@ -196,7 +194,17 @@ def _check_together(
     if prior.measured:
         points = fitted.numbers(fitted.start()).points_m.cpu().numpy()
         height = checks.check_plane(_rest_heights(prepared, points), "the prior shape")
-    return {"fall_m_s2": fall, "impact_misfit": angle, "prior_rest_height_m": height}
+    plane = plane_by_touch(prepared.tracks, [s.phases.release or 0 for s in prepared.smoothed])
+    touched_m, std_m = (None, None) if plane is None else (plane.height_m, plane.std_m)
+    if not prior.measured:
+        checks.check_touched_plane(touched_m, std_m)
+    return {
+        "fall_m_s2": fall,
+        "impact_misfit": angle,
+        "prior_rest_height_m": height,
+        "plane_by_touch_m": touched_m,
+        "plane_by_touch_std_m": std_m,
+    }
 
 
 def _rest_heights(prepared: Prepared, points_m: Float[Array, "v 3"]) -> dict[int, float]:

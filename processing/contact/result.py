@@ -13,8 +13,9 @@ from processing.contact.evaluate import Evaluation
 from processing.contact.learn import ContactLearning
 
 PLANE_NOTE = (
-    "the height of the plane and the size of the object are nearly one: poses alone show a plane that is far off only "
-    "for a box (checks.plane_by_loss_m); with a measured shape the resting object's lowest point shows it"
+    "the height of the plane and the size of the object are nearly one: of poses alone only those that the plane "
+    "carries tell them apart, at 100 Hz and more, and rounded edges read as a plane that is higher by their radius "
+    "(checks.plane_by_touch_m); with a measured shape the resting object's lowest point shows it"
 )
 
 
@@ -83,7 +84,7 @@ def warnings_of(learning: ContactLearning) -> list[str]:
     if learning.untouched_vertices:
         count, of = len(learning.untouched_vertices), len(learning.touched)
         found.append(f"{count} of {of} points were never touched: the prior shape stands there")
-    if (plane := plane_warning(learning.checks.get("plane_by_loss_m"))) is not None:
+    if (plane := plane_warning(*(learning.checks.get(f"plane_by_touch{n}_m") for n in ("", "_std")))) is not None:
         found.append(plane)
     if len(learning.tosses) == 1:
         found.append("one toss only: its intervals come from the loss's curvature, and are wide")

@@ -2,7 +2,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 from scipy.spatial.transform import Rotation
 
 from processing.contact import data_checks as checks
@@ -162,25 +161,3 @@ def test_flight_alone_teaches_nothing(simulated_tosses, box_physics):
         flown.append(PoseSeries(t.toss, t.time_s, rotation, position))
     with pytest.raises(BadInput, match="no contact in the data"):
         learn_contact(flown, prior_from_size("box", 0.08), box_physics)
-
-
-@pytest.mark.parametrize("height_mm, word", [(11, "above"), (-10, "below")])
-def test_a_plane_far_from_where_a_box_fits_best_is_warned_of(height_mm, word):
-    assert checks.plane_warning(3e-3) is None
-    assert checks.plane_warning(-5e-3) is None
-    assert f"{abs(height_mm)} mm {word}" in checks.plane_warning(1e-3 * height_mm)
-
-
-def test_the_plane_by_which_a_box_fits_best_moves_with_the_plane(simulated_tosses, box_physics):
-    from processing.contact.intervals import plane_by_loss
-    from processing.contact.learn import ContactConfig
-    from processing.contact.loss import Weights
-
-    quick = ContactConfig(weights=Weights(dissipation=30.0), bootstrap_repeats=0)
-    learned = learn_contact(simulated_tosses(3), prior_from_size("box", 0.08), box_physics, config=quick)
-    here = plane_by_loss(learned.fitted, learned.fit.parameters, learned.data, learned.weights)
-    learned.data.position_m = learned.data.position_m + torch.tensor([0.0, 0.0, 0.006])
-    higher = learned.fit.parameters.copy()
-    higher[:3] = np.abs(higher[:3]) + 0.006 / 0.05
-    there = plane_by_loss(learned.fitted, higher, learned.data, learned.weights)
-    assert there - here == pytest.approx(0.006, abs=2.5e-3)
