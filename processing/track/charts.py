@@ -100,7 +100,7 @@ def charts_of(
     return Charts(mean, count, anyhow, np.minimum(odd, 3) / 3, free * (anyhow == 0))
 
 
-def _across(axis: Axis) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+def across(axis: Axis) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
     """Two directions that span the plane across the axis."""
     side = np.cross(axis.direction, np.eye(3)[int(np.abs(axis.direction).argmin())])
     side /= np.linalg.norm(side)
@@ -117,7 +117,7 @@ def _pixels(scene: Scene, view: int, pose: Float[Array, "4 4"], axis: Axis) -> _
     rays = np.stack([(u + u0 - center[0]) / focal[0], (v + v0 - center[1]) / focal[1], np.ones(len(u))], -1)
     p, normal = rays * here[:, k.Z, None], here[:, k.NX : k.NZ + 1]
     own, turned = (p - pose[:3, 3]) @ pose[:3, :3] - axis.point_m, normal @ pose[:3, :3]
-    one, two = _across(axis)
+    one, two = across(axis)
     x, y = own @ one, own @ two
     radius = np.maximum(np.hypot(x, y), 1e-6)
     nx, ny = turned @ one, turned @ two
@@ -229,7 +229,7 @@ def _free(
     offset, u0, v0, w, h = (int(x) for x in store.table[view, : k.HEIGHT + 1])
     pixels = store.maps[offset : offset + w * h].reshape(h, w, -1)
     angle = (np.arange(cells) + 0.5) / cells * 2 * np.pi - np.pi
-    one, two = _across(axis)
+    one, two = across(axis)
     outward = np.cos(angle)[:, None] * one + np.sin(angle)[:, None] * two
     along = axis.point_m + ((np.arange(len(profile)) + 0.5) * config.row_m + low)[:, None] * axis.direction
     radius = np.concatenate([profile + layer for layer in config.layers_m])

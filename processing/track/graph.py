@@ -17,6 +17,7 @@ from processing.track import kernels as k
 from processing.track.beam import Schedule, rows
 from processing.track.keyframes import view_directions
 from processing.track.motion import turn_between
+from processing.track.round_body import RoundBody
 from processing.track.views import ViewStore
 from recordings.geometry import rotation_log, skew
 
@@ -121,9 +122,10 @@ def refine(
     motion: Motion,
     config: GraphConfig,
     held: Float[Array, "6"] | None = None,
+    body: RoundBody | None = None,
 ) -> Refined:
     """All poses in `use` at once; those in `fixed` stay. `poses` of other views are returned as they are. No pose moves
-    along the twist `held`, where there is one."""
+    along the twist `held`, where there is one. A round body's profile is solved with them."""
     poses = poses.copy()
     pairs = choose_pairs(poses, use, motion.toss, motion.center_m, config)
     pairs = pairs[~fixed[pairs].all(1)]
@@ -135,7 +137,7 @@ def refine(
     H = np.eye(6 * len(free))
     for row in rows(config.schedule, distance, config.round_body):
         for _ in range(int(row[k.STEPS])):
-            H, g, figures = _normal_equations(store, poses, use, pairs, place, row, motion, config)
+            H, g, figures = _normal_equations(store, poses, use, pairs, place, row, motion, config, body)
             if held is not None:
                 _hold(H, held)
             step = -np.linalg.solve(H + np.diag(1e-6 * np.diag(H) + 1e-9), g).reshape(-1, 6)
@@ -156,7 +158,7 @@ def _hold(H: Float[Array, "f f"], held: Float[Array, "6"]) -> None:
 
 def _normal_equations(
     store: ViewStore, poses: Float[Array, "n 4 4"], use: Bool[Array, " n"], pairs: Int[Array, "m 2"],
-    place: Int[Array, " n"], row: Float[Array, "7"], motion: Motion, config: GraphConfig,
+    place: Int[Array, " n"], row: Float[Array, "7"], motion: Motion, config: GraphConfig, body: RoundBody | None,
 ) -> tuple[Float[Array, "f f"], Float[Array, " f"], Float[Array, "m 3"]]:  # fmt: skip
     count = int(place.max()) + 1
     blocks, gradients = np.zeros((len(pairs), 6, 6)), np.zeros((len(pairs), 6))
@@ -176,6 +178,8 @@ def _normal_equations(
     np.add.at(g, i[i >= 0], gradients[i >= 0])
     np.add.at(g, j[j >= 0], -gradients[j >= 0])
     _add_motion(H, g, poses, use, place, motion, config)
+    if body is not None:
+        body.add(H, g, poses, place)
     return H.transpose(0, 2, 1, 3).reshape(6 * count, 6 * count), g.reshape(-1), figures
 
 

@@ -45,6 +45,11 @@ class Axis:
         out[:3, 3] = self.point_m - out[:3, :3] @ self.point_m
         return out
 
+    def seen_from(self, new_from_old: Float[Array, "4 4"]) -> Axis:
+        """The same line in another object frame."""
+        direction = new_from_old[:3, :3] @ self.direction
+        return Axis(direction, _foot(new_from_old[:3, :3] @ self.point_m + new_from_old[:3, 3], direction))
+
     @property
     def twist(self) -> Float[Array, "6"]:
         """Per radian (translation, rotation)."""

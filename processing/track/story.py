@@ -15,6 +15,7 @@ from processing.track.graph import GraphConfig, Motion, Refined, refine, steady_
 from processing.track.middle import center_of_mass
 from processing.track.motion import MotionConfig, change_cost, turn_between
 from processing.track.round_axis import Axis, open_axis
+from processing.track.round_body import BodyConfig, RoundBody, anchored
 from processing.track.turns import TurnConfig, Turned, contradiction, doubted, turned
 
 
@@ -31,6 +32,7 @@ class StoryConfig:
     turns: TurnConfig = field(default_factory=TurnConfig)
     round_body: GraphConfig = field(default_factory=lambda: GraphConfig(round_body=True))
     """Refinement of a round body whose looks do not tell its turn."""
+    body: BodyConfig = field(default_factory=BodyConfig)
     freed: float = 0.98
     """That refinement may change the turns that were found where what speaks against them falls below this share."""
 
@@ -48,6 +50,8 @@ class Story:
     motion: Motion
     badness: float
     turned: Turned | None = None
+    axis: Axis | None = None
+    """Of a round body, all of whose views were laid onto one profile."""
 
 
 def settled(scene: Scene, stories: list[Hypothesis], first: int, keep_first: bool, config: StoryConfig) -> list[Story]:
@@ -75,17 +79,25 @@ def _sought(scene: Scene, stories: list[Story], first: int, keep_first: bool, co
     axis = open_axis(scene, best.joint.poses[:n], best.use, config.turns.axis)
     if axis is None or len(scene.store) > n:
         return None
+    easy = replace(config, graph=config.round_body)
+    straight = refined(scene, replace(best.told, poses=best.joint.poses), first, keep_first, easy, axis, held=True)
+    assert straight.axis is not None
     rivals = [s.joint.poses[:n] for s in stories[1:]]
-    found = turned(scene, best.joint.poses[:n], rivals, best.use, first, axis, config.turns)
-    if len(stories) == 1 and apart_deg(best.joint.poses[:n], found.poses) < config.agreeing_deg:
-        return None
-    told, easy = replace(best.told, poses=found.poses), replace(config, graph=config.round_body)
-    both = [refined(scene, told, first, keep_first, easy, a) for a in (axis, None)]
-    held, free = (contradiction(scene, s.joint.poses[:n], s.use, found, config.turns) for s in both)
+    found = turned(scene, straight.joint.poses[:n], rivals, straight.use, first, straight.axis, config.turns)
+    if len(stories) == 1 and apart_deg(straight.joint.poses[:n], found.poses) < config.agreeing_deg:
+        return refined(scene, replace(best.told, poses=straight.joint.poses), first, keep_first, config, straight.axis)
+    told = replace(best.told, poses=found.poses)
+    both = [refined(scene, told, first, keep_first, easy, found.axis, held) for held in (True, False)]
+    held, free = (_contradiction(scene, s, found, config) for s in both)
     kept, said = (both[1], free) if free < config.freed * held else (both[0], held)
-    if len(stories) == 1 and contradiction(scene, best.joint.poses[:n], best.use, found, config.turns) < said:
-        return None
-    return replace(kept, turned=doubted(found, said, first, config.turns))
+    if len(stories) == 1 and _contradiction(scene, straight, found, config) < said:
+        return refined(scene, replace(best.told, poses=straight.joint.poses), first, keep_first, config, straight.axis)
+    return replace(kept, turned=doubted(replace(found, axis=kept.axis or axis), said, first, config.turns))
+
+
+def _contradiction(scene: Scene, story: Story, found: Turned, config: StoryConfig) -> float:
+    own = found if story.axis is None else replace(found, axis=story.axis)
+    return contradiction(scene, story.joint.poses[: len(scene.times_s)], story.use, own, config.turns)
 
 
 def _again(stories: list[Story], scene: Scene, first: int, keep_first: bool, config: StoryConfig) -> list[Story]:
@@ -94,7 +106,8 @@ def _again(stories: list[Story], scene: Scene, first: int, keep_first: bool, con
         return stories
     best = replace(stories[0].told, poses=stories[0].joint.poses)
     found = stories[0].turned
-    again = refined(scene, best, first, keep_first, config, None if found is None else found.axis)
+    axis = stories[0].axis
+    again = refined(scene, best, first, keep_first, config, axis, held=found is not None)
     return [replace(again, turned=found), *stories[1:]]
 
 
@@ -110,10 +123,11 @@ def apart_deg(one: Float[Array, "n 4 4"], other: Float[Array, "n 4 4"]) -> float
 
 
 def refined(
-    scene: Scene, best: Hypothesis, first: int, keep_first: bool, config: StoryConfig, axis: Axis | None = None
-) -> Story:
-    """Joint refinement of all tracked views, depth moved to colour's exposure by the story's own motion; turns about
-    `axis` stay, where there is one."""
+    scene: Scene, best: Hypothesis, first: int, keep_first: bool, config: StoryConfig, axis: Axis | None = None,
+    held: bool = False,
+) -> Story:  # fmt: skip
+    """Joint refinement of all tracked views, depth moved to colour's exposure by the story's own motion; of a round
+    body, where its `axis` is given, with its profile, and turns about it stay where they are `held`."""
     n, all_views = len(scene.times_s), len(scene.store)
     use = np.isfinite(best.poses[:n, 0, 0])
     fixed = np.arange(all_views) >= n
@@ -128,18 +142,18 @@ def refined(
         use = use & put_at_color_times(scene, poses[:n], use)
     center_m = center_of_mass(poses[:n], use, scene)
     motion = Motion(times_s, whose, scene.gravity_camera_m_s2, center_m, still)
-    joint = refine(
-        scene.store,
-        poses,
-        np.concatenate([use, drawn]),
-        fixed,
-        motion,
-        config.graph,
-        None if axis is None else axis.twist,
-    )
+    seen = np.concatenate([use, drawn])
+    if axis is None:
+        joint = refine(scene.store, poses, seen, fixed, motion, config.graph)
+    else:
+        body = RoundBody(scene.store, poses, use, axis, config.body)
+        twist = axis.twist if held else None
+        joint = refine(scene.store, poses, seen, np.zeros_like(fixed), motion, config.graph, twist, body)
+        moved, spread, axis = anchored(joint.poses, joint.covariance, axis, first, poses[first])
+        joint = replace(joint, poses=moved, covariance=spread)
     fit = np.nanmean(per_view(joint.pairs, joint.figures, all_views)[0][:n]) if len(joint.pairs) else 0.0
     price = mean_price(joint.poses[:n], use, scene, center_m, config.motion)
-    return Story(best, use, fixed, joint, center_m, motion, float(fit + price))
+    return Story(best, use, fixed, joint, center_m, motion, float(fit + price), axis=axis)
 
 
 def mean_price(
