@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,18 +14,18 @@ from numpy import ndarray as Array
 from processing.backends import make_segmenter, settings_of
 from processing.given_masks import chosen_masks
 from processing.rig import CAMERA, Rig, RobotOfSession, rig_stage
+from processing.scene_tosses import hidden_by_robot, keys_beside, read, scene_frames
 from processing.segment.background import NOT_FOUND, BackgroundSegmenter
 from processing.segment.candidates import Finder
 from processing.segment.robot_frames import RobotFrames
 from processing.segment.robot_view import RobotView
 from processing.segment.segmenter import Example
 from processing.segment.sighting import courses_of, look_of, read_sighting, sightings, write_sightings
-from processing.segment.static_scene import StaticScene, calibrated_table_depth, learn_scene, sample_positions
+from processing.segment.static_scene import StaticScene, calibrated_table_depth, learn_scene
 from processing.stage import Counts, Done
 from recordings.errors import BadInput
 from recordings.records import RgbdFrame
 from recordings.results import write_masks
-from recordings.robot import panda
 from recordings.session import RgbdFrames
 
 if TYPE_CHECKING:
@@ -33,41 +33,40 @@ if TYPE_CHECKING:
 
 
 def static_scene(run: Run) -> Done:
-    """Stage `scene`: what the camera sees without the object, from frames of all tosses of the run."""
+    """Stage `scene`: what the camera sees without the object, from frames of all tosses of the run and of those beside
+    them in the session that can be read and show the same."""
     inputs = {name: run.keys[name] for name in ("calibration", *(f"toss_{t:02d}" for t in run.recorded))}
-    return run.store.run("scene", 4, run.config.scene, inputs, lambda folder: _learn_scene(run, folder))
+    inputs |= keys_beside(run)
+    return run.store.run("scene", 5, run.config.scene, inputs, lambda folder: _learn_scene(run, folder))
+
+
+def scene_notes(run: Run) -> tuple[str, ...]:
+    """Which tosses of the session, not of the run, were of no use for the scene, and why."""
+    left_out = static_scene(run).counts.get("left_out", {})
+    return tuple(f"toss {t} gives no frames of the background: {why}" for t, why in left_out.items())
 
 
 def _learn_scene(run: Run, folder: Path) -> Counts:
-    streams = [run.session.toss(t).rgbd(CAMERA) for t in run.recorded]
-    chosen = sample_positions([len(s) for s in streams], run.config.scene.frames)
+    found = scene_frames(run)
     progress = run.progress("static scene")
 
     def frames() -> Iterator[RgbdFrame]:
-        for done, (toss, position) in enumerate(chosen):
-            progress.step(done, len(chosen))
-            yield streams[toss][position]
+        for done, at in enumerate(found.chosen):
+            progress.step(done, len(found.chosen))
+            yield read(found, at)
 
-    hidden = _hidden_by_robot(run, [(run.recorded[t], int(streams[t].times_ns[i])) for t, i in chosen])
+    hidden = hidden_by_robot(run, [(t, int(found.streams[t].times_ns[i])) for t, i in found.chosen])
     table = calibrated_table_depth(run.session.calibration, CAMERA)
-    scene = learn_scene(frames(), table, run.config.scene, hidden)
+    scene = learn_scene(frames(), table, run.config.scene, hidden, [t for t, _ in found.chosen])
     scene.write(folder)
     return {
-        "frames": len(chosen),
+        "frames": len(found.chosen),
+        "tosses": sorted(found.streams),
+        "left_out": {str(t): why for t, why in found.left_out.items()},
         "pixels_with_depth": int((scene.depth_m > 0).sum()),
         "known_share": round(float(scene.known.mean()), 4),
         "robot_left_out": hidden is not None,
     }
-
-
-def _hidden_by_robot(run: Run, at: Sequence[tuple[int, int]]) -> list[Bool[Array, "h w"]] | None:
-    """Where the robot, or what it holds, may stand in front of the scene, at (toss, time); None without a robot."""
-    robot = RobotOfSession(run.session)
-    if robot.missing(run.recorded) is not None:
-        return None
-    camera, settings = run.session.calibration.camera(CAMERA), run.config.scene
-    view = RobotView(panda(), camera)
-    return [robot.hides(view, camera, toss, time_ns, settings.robot_margin_px, settings.held_m) for toss, time_ns in at]
 
 
 def object_masks(run: Run, toss: int, scene: Done) -> Done:
@@ -119,7 +118,7 @@ def object_masks(run: Run, toss: int, scene: Done) -> Done:
 
     named = settings_of(run.config.backends.segmenter, run.config.backends)
     config = {"given_masks": choice, "background": asdict(run.config.masks), **named}
-    return run.store.run("segment", 3, config, inputs, compute)
+    return run.store.run("segment", 4, config, inputs, compute)
 
 
 def _given(run: Run, toss: int) -> dict[int, Bool[Array, "h w"]]:
@@ -142,7 +141,7 @@ def finding(run: Run, scene: Done, rig: Done) -> Done:
     inputs = {"scene": scene.key, "rig": rig.key, "calibration": run.keys["calibration"]}
     inputs |= {f"toss_{t:02d}": run.keys[f"toss_{t:02d}"] for t in run.recorded}
     config = {"given_masks": run.config.given_masks, **asdict(run.config.find)}
-    return run.store.run("find", 4, config, inputs, lambda folder: _find(run, scene, rig, folder))
+    return run.store.run("find", 5, config, inputs, lambda folder: _find(run, scene, rig, folder))
 
 
 def _find(run: Run, scene: Done, rig: Done, folder: Path) -> Counts:

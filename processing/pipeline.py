@@ -20,7 +20,7 @@ from processing.cycle import Pass, alone_start, run_cycle
 from processing.dynamics import rollout_stage
 from processing.frames import corrected_frames
 from processing.lost_tosses import with_lost, without_lost
-from processing.masks import object_masks, static_scene
+from processing.masks import object_masks, scene_notes, static_scene
 from processing.one_shape import of_one_shape
 from processing.segment.static_scene import StaticScene
 from processing.stage import Counts, Done, Store, locked, plain
@@ -267,7 +267,7 @@ def _record(run: Run, variant: Variant, scope: Scope, last: Pass, masks: Mapping
         shared_object_frame=last.shared_frame,
         session_path=os.path.relpath(run.session.path.resolve(), run.store.results.resolve()),
         warnings=(*run.warnings, *last.warnings),
-        notes=(f"tracker: {run.tracker}", *last.notes),
+        notes=(f"tracker: {run.tracker}", *scene_notes(run), *last.notes),
         extra={
             "tracker": run.tracker,
             "contact_of_toss": contact,

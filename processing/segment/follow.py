@@ -141,7 +141,10 @@ def follow(
     if rough.sum() < s.least_px:
         return Found(np.zeros_like(rough), 0.0, others_px, False)
     wide = grown(rough, 5)
-    strange = (wide & (~scene.known if beside is None else beside.unknown)).sum() > s.unknown * rough.sum()
+    unknown = ~scene.known if beside is None else beside.unknown
+    if not memory.others_near:  # where nothing else is near, depth before the table tells enough
+        unknown = unknown & (scene.depth_m == 0)
+    strange = (wide & unknown).sum() > s.unknown * rough.sum()
     larger = rough.sum() > s.grown * area
     if strange or (larger and not _is_all_object(frame, rough, expected, memory, s)):
         rough = _among_others(frame, scene, moved, expected, memory, beside, s)
@@ -150,13 +153,15 @@ def follow(
         mask, sure = rough, 0.6
     else:
         least = None if beside is None else s.piece_px
+        bare = None if scene.known[wide].all() else np.where(scene.known, 0, memory.likeness.log_odds(frame.color_rgb))
         # where the scene's colour is known, it tells; the robot's colours speak against the object only
-        odds = None if beside is None else np.where(scene.known, np.minimum(beside.odds, 0), beside.odds)
+        odds = bare if beside is None else np.where(scene.known, np.minimum(beside.odds, 0), beside.odds)
         mask, sure = refine_border(frame, scene, rough, odds, s.foreground, least)
     if block is not None:
         mask = mask & ~block
     ratio = min(mask.sum(), area) / max(mask.sum(), area, 1)
-    others_near = others_px > s.least_px or int((moved & near & ~mask).sum()) > 3 * s.least_px
+    solid = moved & near & (frame.depth_m > 0)  # what only looks different may be the object's shadow
+    others_near = int((solid & ~grown(mask, 3)).sum()) > s.least_px or int((solid & ~mask).sum()) > 3 * s.least_px
     largest = _largest_other(moved & ~grown(mask, 9), s)
     return Found(mask, float(np.clip(sure * min(1.0, ratio / 0.7), 0, 1)), others_px, others_near, largest)
 

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, UInt8
+from jaxtyping import Bool, Float, Float32
 from numpy import ndarray as Array
 
+from processing.segment.moving_camera import refuse_moving_camera
 from recordings.errors import BadInput
 from recordings.geometry import CameraModel, Transform
 from recordings.records import RgbdFrame
@@ -27,6 +27,16 @@ class SceneSettings:
     """The scene lies at this quantile of the depths seen by a pixel: things in front of it come and go."""
     seen_share: float = 0.4
     """A pixel whose depth agrees with the scene in fewer frames has no scene depth."""
+    table_looks: int = 3
+    """What stands in front of the table is not the scene where the table was seen in so many frames."""
+    stands_m: float = 0.008
+    """What is higher above the table (or 4 standard deviations of depth) stands on it."""
+    always_share: float = 0.97
+    """What returned a pixel's depth more often than this was always there."""
+    arrived_share: float = 0.1
+    """A thing came to where it stands when the table was seen at other times beneath so much of it."""
+    object_m: float = 0.1
+    """Nearer and farther than that part the thing reaches no more than this."""
     returns_share: float = 0.3
     """A pixel without scene depth that gave a return in more frames than this is unknown: something was often there."""
     no_return_share: float = 0.2
@@ -89,10 +99,12 @@ def learn_scene(
     table_depth_m: Float32[Array, "h w"] | None,
     settings: SceneSettings,
     hidden: Sequence[Bool[Array, "h w"]] | None = None,
+    tosses: Sequence[int] | None = None,
 ) -> StaticScene:
     """Learn the scene from frames spread over the session. Raises BadInput where the camera moved between them.
 
-    `hidden`: pixels of each of these frames at which something known (the robot) may stand in front of the scene.
+    `hidden`: pixels of each of these frames at which something known (the robot) may stand in front of the scene;
+    `tosses`: which toss each frame belongs to, in time order within a toss (None: all are of one).
     """
     colors, depths = [], []
     for frame in frames:
@@ -111,69 +123,65 @@ def learn_scene(
         covered = np.zeros((len(depths), len(depths[0][part]), width), dtype=bool)
         if hidden is not None:
             covered = np.stack([h[part] for h in hidden])
-        rows.append(_learn_rows([c[part] for c in colors], [d[part] for d in depths], covered, settings))
-    depth, sigma, color, color_sigma, known = (np.concatenate(part) for part in zip(*rows))
-    known = ~_without_thin_lines(~known)
+        rows.append(_learn_rows([c[part] for c in colors], [d[part] for d in depths], covered, table[part], settings))
+    depth, sigma, color, color_sigma, known, share = (np.concatenate(part) for part in zip(*rows))
+    never_bare = np.zeros_like(known)
+    for first, last in _ends(tosses, len(depths)):
+        for end in {first, last}:
+            never_bare |= _always_covered(depths[end], depth, share, table, settings)
+    known = ~_without_thin_lines(~known | never_bare)
     if known.mean() < settings.still_share:
         raise BadInput(
             f"only {100 * known.mean():.0f} % of the pixels show a static scene; this camera seems to move. "
             "Masks need a camera that stands still: record from a fixed one"
         )
-    depth = np.where(known, depth, table)
+    depth = np.where(known & ~never_bare, depth, table)
     return StaticScene(depth, sigma, color, color_sigma, known, table)
 
 
-def refuse_moving_camera(colors: Sequence[UInt8[Array, "h w 3"]], hidden: Sequence[Bool[Array, "h w"]] | None) -> None:
-    """Raise BadInput where the picture as a whole shifts between frames.
-
-    Corners of one frame are followed into the others; things that move are few against a room that stands still.
-    """
-    shifts = [s for s in picture_shifts(colors, hidden) if np.isfinite(s)]
-    if not shifts or max(shifts) < MOVED_PX:
-        return
-    moved = sum(s >= MOVED_PX for s in shifts)
-    raise BadInput(
-        f"this camera seems to move: the picture as a whole shifts by up to {max(shifts):.1f} px within the session "
-        f"(more than {MOVED_PX:g} px in {moved} of {len(shifts)} frames looked at). "
-        "Masks need a camera that stands still: record from a fixed one; where it was bumped once, "
-        "process the tosses before and after it apart, `--toss I-J`"
-    )
+def _ends(tosses: Sequence[int] | None, count: int) -> list[tuple[int, int]]:
+    """The first and the last frame of every toss."""
+    whose = np.zeros(count, dtype=np.int64) if tosses is None else np.asarray(tosses)
+    starts = np.flatnonzero(np.diff(whose, prepend=whose[0] - 1))
+    return list(zip(starts.tolist(), [*(starts[1:] - 1).tolist(), count - 1]))
 
 
-MOVED_PX = 1.5
-CORNERS = 250
-LEAST_CORNERS = 40
-FOLLOW: Mapping[str, Any] = {"winSize": (21, 21), "maxLevel": 3}
+def _always_covered(
+    depth_m: Float32[Array, "h w"],
+    scene_m: Float32[Array, "h w"],
+    share: Float32[Array, "h w"],
+    table_m: Float32[Array, "h w"],
+    settings: SceneSettings,
+) -> Bool[Array, "h w"]:
+    """Pixels whose learned scene is the object itself, as it stands above the table in a toss's first or last frame:
+    something else was in front of them at all other times, so what is beneath was never seen.
 
-
-def picture_shifts(colors: Sequence[UInt8[Array, "h w 3"]], hidden: Sequence[Bool[Array, "h w"]] | None) -> list[float]:
-    """How far the picture as a whole has shifted (px) from the middle frame; NaN where too little can be followed.
-
-    It is the median over the followed corners of each one's distance, so that less than half of them may be on things
-    that really move.
+    What stands there in that frame is no part of the scene where the table was seen beneath much of it at other times;
+    the rest of it, which was not always there, isn't either.
     """
     import cv2
 
-    middle = len(colors) // 2
-    grey = [cv2.cvtColor(np.ascontiguousarray(c), cv2.COLOR_RGB2GRAY) for c in colors[:: max(1, len(colors) // 16)]]
-    reference = cv2.cvtColor(np.ascontiguousarray(colors[middle]), cv2.COLOR_RGB2GRAY)
-    free = None if hidden is None else np.where(hidden[middle], 0, 255).astype(np.uint8)
-    corners = cv2.goodFeaturesToTrack(reference, CORNERS, 0.01, 6, mask=free)
-    if corners is None or len(corners) < LEAST_CORNERS:
-        return [float("nan")] * len(grey)
-    return [_shift(reference, other, corners) for other in grey]
-
-
-def _shift(reference: UInt8[Array, "h w"], other: UInt8[Array, "h w"], corners: Float32[Array, "n 1 2"]) -> float:
-    import cv2
-
-    there, found, _ = cv2.calcOpticalFlowPyrLK(reference, other, corners, corners.copy(), **FOLLOW)
-    back, again, _ = cv2.calcOpticalFlowPyrLK(other, reference, there, there.copy(), **FOLLOW)
-    followed = (np.asarray(found) > 0).ravel() & (np.asarray(again) > 0).ravel()
-    good = followed & (np.linalg.norm(np.asarray(back) - corners, axis=-1).ravel() < 0.5)
-    if good.sum() < LEAST_CORNERS:
-        return float("nan")
-    return float(np.median(np.linalg.norm(np.asarray(there) - corners, axis=-1).ravel()[good]))
+    lift = np.maximum(settings.stands_m, 4 * stereo_sigma_m(table_m))
+    stands = (depth_m > 0) & (table_m - depth_m > lift)
+    above = (scene_m > 0) & (table_m - scene_m > lift)
+    doubtful = stands & above & (share < settings.always_share)
+    doubtful &= np.abs(depth_m - scene_m) < np.maximum(0.006, 5 * stereo_sigma_m(scene_m))
+    out = np.zeros_like(stands)
+    if not doubtful.any():
+        return out
+    arrived = stands & (scene_m > 0) & ~above
+    _, labels = cv2.connectedComponents(stands.astype(np.uint8), connectivity=4)
+    for k in np.unique(labels[doubtful]):
+        thing = np.asarray(labels == k)
+        came = thing & arrived
+        if came.sum() < settings.arrived_share * (thing & ~(above & (share >= settings.always_share))).sum():
+            continue
+        near, far = np.quantile(depth_m[came], (0.02, 0.98)) if came.any() else (0.0, 0.0)
+        inside = (depth_m > near - settings.object_m) & (depth_m < far + settings.object_m)
+        out |= thing & doubtful & inside
+    solid = cv2.morphologyEx(out.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))  # no flickering edges
+    grown = cv2.dilate(solid, np.ones((5, 5), np.uint8)) > 0
+    return grown & (above | (scene_m == 0))
 
 
 def _without_thin_lines(mask: Bool[Array, "h w"]) -> Bool[Array, "h w"]:
@@ -184,30 +192,50 @@ def _without_thin_lines(mask: Bool[Array, "h w"]) -> Bool[Array, "h w"]:
 
 
 def _learn_rows(
-    colors: Sequence[Array], depths: Sequence[Array], hidden: Bool[Array, "n h w"], settings: SceneSettings
-) -> tuple[Array, Array, Array, Array, Array]:
-    """Scene depth, its noise, colour, its noise and whether known, for some rows, from what is not hidden."""
+    colors: Sequence[Array],
+    depths: Sequence[Array],
+    hidden: Bool[Array, "n h w"],
+    table_m: Float32[Array, "h w"],
+    settings: SceneSettings,
+) -> tuple[Array, Array, Array, Array, Array, Array]:
+    """Scene depth, its noise, colour, its noise, whether known, and the share of returns that were the scene, for some
+    rows, from what is not hidden."""
     never = (~hidden).sum(0) < settings.least_looks
     hidden = hidden & ~never  # what stands there for the whole session is a part of the scene
     z = np.where(hidden, np.float32(0), np.stack(depths))
     looks = np.maximum((~hidden).sum(0), 1)
     seen = z > 0
+    without = (~seen & ~hidden).sum(0) / looks
+    far = _farthest(z, seen, settings)
+    agrees = seen & (np.abs(z - far) < np.maximum(0.006, 5 * stereo_sigma_m(far)))
+    near_table_m = np.maximum(0.006, 3 * stereo_sigma_m(table_m))
+    on_table = seen & (np.abs(z - table_m) < near_table_m)
+    # where the table was seen it is the scene, however long an object stood before it or its shadow hid the depth
+    beneath = (on_table.sum(0) >= settings.table_looks) & (far < table_m + near_table_m)
+    agrees = np.where(beneath, on_table, agrees)
+    share = agrees.sum(0) / looks
+    valid = (
+        beneath
+        | (share >= settings.seen_share)
+        | ((share > 1 - settings.far_share) & (without < settings.no_return_share))
+    )
+    depth = _masked_median(z, agrees)
+    sigma = 1.48 * _masked_median(np.abs(z - depth), agrees)
+    empty = (agrees | (~seen & ~valid[None])) & ~hidden
+    color, color_sigma = _color_median(np.stack(colors), empty)
+    depth, sigma = np.where(valid, depth, 0), np.where(valid, sigma, 0)
+    empty_alike = ~valid & (without >= settings.no_return_share) & (color_sigma < settings.no_return_color)
+    known = valid | (seen.sum(0) / looks < settings.returns_share) | empty_alike
+    share = agrees.sum(0) / np.maximum(seen.sum(0), 1)
+    return depth.astype(np.float32), sigma.astype(np.float32), color, color_sigma, known, share.astype(np.float32)
+
+
+def _farthest(z: Float32[Array, "n h w"], seen: Bool[Array, "n h w"], settings: SceneSettings) -> Float32[Array, "h w"]:
+    """The quantile `far_share` of the depths that each pixel saw; 0 where it saw none."""
     count = seen.sum(0)
     ordered = np.sort(z, axis=0)  # zeros come first
     at = np.clip(len(z) - count + (settings.far_share * (count - 1)).astype(int), 0, len(z) - 1)
-    far = np.take_along_axis(ordered, at[None], 0)[0]
-    agrees = seen & (np.abs(z - far) < np.maximum(0.006, 5 * stereo_sigma_m(far)))
-    share = agrees.sum(0) / looks
-    depth = _masked_median(z, agrees)
-    sigma = 1.48 * _masked_median(np.abs(z - depth), agrees)
-    empty = (agrees | (~seen & (share < settings.seen_share)[None])) & ~hidden
-    color, color_sigma = _color_median(np.stack(colors), empty)
-    valid = share >= settings.seen_share
-    depth, sigma = np.where(valid, depth, 0), np.where(valid, sigma, 0)
-    without = (~seen & ~hidden).sum(0) / looks
-    empty_alike = ~valid & (without >= settings.no_return_share) & (color_sigma < settings.no_return_color)
-    known = valid | (seen.sum(0) / looks < settings.returns_share) | empty_alike
-    return depth.astype(np.float32), sigma.astype(np.float32), color, color_sigma, known
+    return np.asarray(np.take_along_axis(ordered, at[None], 0)[0])
 
 
 def _color_median(colors: Array, empty: Bool[Array, "n h w"]) -> tuple[Float32[Array, "h w 3"], Float32[Array, "h w"]]:

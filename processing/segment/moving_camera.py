@@ -1,0 +1,113 @@
+"""Whether the camera stood still and sees the same scene: the picture as a whole against that of another frame."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float32, UInt8
+from numpy import ndarray as Array
+
+from recordings.errors import BadInput
+from recordings.records import RgbdFrame
+
+
+def refuse_moving_camera(colors: Sequence[UInt8[Array, "h w 3"]], hidden: Sequence[Bool[Array, "h w"]] | None) -> None:
+    """Raise BadInput where the picture as a whole shifts between frames.
+
+    Corners of one frame are followed into the others; things that move are few against a room that stands still.
+    """
+    shifts = [s for s in picture_shifts(colors, hidden) if np.isfinite(s)]
+    if not shifts or max(shifts) < MOVED_PX:
+        return
+    moved = sum(s >= MOVED_PX for s in shifts)
+    raise BadInput(
+        f"this camera seems to move: the picture as a whole shifts by up to {max(shifts):.1f} px within the session "
+        f"(more than {MOVED_PX:g} px in {moved} of {len(shifts)} frames looked at). "
+        "Masks need a camera that stands still: record from a fixed one; where it was bumped once, "
+        "process the tosses before and after it apart, `--toss I-J`"
+    )
+
+
+MOVED_PX = 1.5
+SAME_SCENE = 0.6
+"""Another toss shows the same scene where so much of its depth agrees; object, hand and robot come and go."""
+CORNERS = 250
+LEAST_CORNERS = 40
+FOLLOW: Mapping[str, Any] = {"winSize": (21, 21), "maxLevel": 3}
+
+
+def picture_shifts(colors: Sequence[UInt8[Array, "h w 3"]], hidden: Sequence[Bool[Array, "h w"]] | None) -> list[float]:
+    """How far the picture as a whole has shifted (px) from the middle frame; NaN where too little can be followed.
+
+    It is the median over the followed corners of each one's distance, so that less than half of them may be on things
+    that really move.
+    """
+    middle = len(colors) // 2
+    others = colors[:: max(1, len(colors) // 16)]
+    reference, corners = _corners(colors[middle], None if hidden is None else hidden[middle])
+    if corners is None:
+        return [float("nan")] * len(others)
+    return [_shift(reference, _grey(other), corners) for other in others]
+
+
+def why_other_scene(
+    reference: RgbdFrame, others: Sequence[RgbdFrame], hidden: Sequence[Bool[Array, "h w"]] | None
+) -> str | None:
+    """Why these frames do not show the scene of the reference frame; None where they do.
+
+    `hidden`: where something known (the robot) may stand in the reference frame and in each other one.
+    """
+    if any(f.color_rgb.shape != reference.color_rgb.shape for f in others):
+        return "its images have another size"
+    grey, corners = _corners(reference.color_rgb, None if hidden is None else hidden[0])
+    shifts = [] if corners is None else [_shift(grey, _grey(f.color_rgb), corners) for f in others]
+    if shifts and np.isnan(shifts).all():
+        return "its picture has nothing in common with theirs"
+    if shifts and np.nanmax(shifts) >= MOVED_PX / 2:
+        return f"the camera was moved (its picture is shifted by {np.nanmax(shifts):.1f} px)"
+    covered = [np.zeros(grey.shape, dtype=bool)] * (len(others) + 1) if hidden is None else hidden
+    alike = [_share_alike(reference, f, covered[0] | h) for f, h in zip(others, covered[1:], strict=True)]
+    if np.median(alike) < SAME_SCENE:
+        return f"its depth shows another scene ({100 * np.median(alike):.0f} % of it agree)"
+    return None
+
+
+def _share_alike(reference: RgbdFrame, other: RgbdFrame, hidden: Bool[Array, "h w"]) -> float:
+    """Share of the pixels seen in both frames that have the same depth; 0 where hardly any is seen in both."""
+    one, two = reference.depth_m, other.depth_m
+    both = (one > 0) & (two > 0) & ~hidden
+    if both.sum() < 0.05 * ((one > 0) & ~hidden).sum() or not both.any():
+        return 0.0
+    return float((np.abs(one[both] - two[both]) < np.maximum(0.02, 0.03 * one[both] ** 2)).mean())
+
+
+def _grey(color_rgb: UInt8[Array, "h w 3"]) -> UInt8[Array, "h w"]:
+    import cv2
+
+    return np.asarray(cv2.cvtColor(np.ascontiguousarray(color_rgb), cv2.COLOR_RGB2GRAY))
+
+
+def _corners(
+    color_rgb: UInt8[Array, "h w 3"], hidden: Bool[Array, "h w"] | None
+) -> tuple[UInt8[Array, "h w"], Float32[Array, "n 1 2"] | None]:
+    """The picture in grey, and its corners; None where there are too few."""
+    import cv2
+
+    grey = _grey(color_rgb)
+    free = None if hidden is None else np.where(hidden, 0, 255).astype(np.uint8)
+    corners = cv2.goodFeaturesToTrack(grey, CORNERS, 0.01, 6, mask=free)
+    return grey, None if corners is None or len(corners) < LEAST_CORNERS else np.asarray(corners)
+
+
+def _shift(reference: UInt8[Array, "h w"], other: UInt8[Array, "h w"], corners: Float32[Array, "n 1 2"]) -> float:
+    import cv2
+
+    there, found, _ = cv2.calcOpticalFlowPyrLK(reference, other, corners, corners.copy(), **FOLLOW)
+    back, again, _ = cv2.calcOpticalFlowPyrLK(other, reference, there, there.copy(), **FOLLOW)
+    followed = (np.asarray(found) > 0).ravel() & (np.asarray(again) > 0).ravel()
+    good = followed & (np.linalg.norm(np.asarray(back) - corners, axis=-1).ravel() < 0.5)
+    if good.sum() < LEAST_CORNERS:
+        return float("nan")
+    return float(np.median(np.linalg.norm(np.asarray(there) - corners, axis=-1).ravel()[good]))
