@@ -97,8 +97,10 @@ DRAWN = np.concatenate([_half, -_half], 1)
 class Forecasts:
     """Tosses ready to be forecast under one law after another."""
 
-    def __init__(self, courses: Sequence[Course], body: RigidBody, noise: Noise) -> None:
+    def __init__(self, courses: Sequence[Course], body: RigidBody, noise: Noise, reach_m: float | None = None) -> None:
+        """`reach_m`: the lever of turns in scores, where bodies of several sizes are to be compared by them."""
         self.body, self.noise = body, noise
+        self.reach_m = body.reach_m if reach_m is None else reach_m
         before = [self._before_impact(c) for c in courses]
         self._start = [np.concatenate([p[i] for p in before]) for i in range(4)]
         first = [max(c.flight - 1, 1) for c in courses]
@@ -124,13 +126,14 @@ class Forecasts:
     def scores(self, laws: Sequence[Law]) -> Float[Array, "m n"]:
         """The energy score of every law and toss: the sum over frames, each in units of how far off forecasts of it
         are on average (over the laws that were asked for first, for all the same)."""
-        energy, off = self._energies(np.array([[w.friction, w.restitution, w.unexplained] for w in laws]))
+        energy, off = self.energies(laws)
         if self._scale_m is None:
             self._scale_m = np.maximum(off.mean(0), self.noise.position_m)
         return (energy / self._scale_m).sum(2)
 
-    def _energies(self, laws: Float[Array, "m 3"]) -> tuple[Float[Array, "m n k"], Float[Array, "m n k"]]:
+    def energies(self, wanted: Sequence[Law]) -> tuple[Float[Array, "m n k"], Float[Array, "m n k"]]:
         """Energy score and mean distance in metres, per law, toss and frame; 0 where a toss has ended."""
+        laws = np.array([[w.friction, w.restitution, w.unexplained] for w in wanted])
         parts = [np.repeat(p[None], len(laws), 0) for p in self._start]
         longest = max(len(c.time_s) for c in self.courses)
         energy, off = (np.zeros((len(laws), len(self.courses), longest)) for _ in range(2))
@@ -149,7 +152,7 @@ class Forecasts:
         """A random change of velocity of this size in the middle of dt, and of spin by the same push at a lever."""
         kick = speed_m_s[..., None] * DRAWN[k, :, :6]
         parts[1][...] += 0.5 * dt[:, None, None] * kick[..., :3]
-        parts[2][...] += kick[..., 3:] / self.body.reach_m
+        parts[2][...] += kick[..., 3:] / self.reach_m
         parts[3][...] += kick[..., :3]
 
     def _judged(
@@ -168,7 +171,7 @@ class Forecasts:
 
     def _placed(self, rotation: Float[Array, "*n 3 3"], position_m: Float[Array, "*n 3"]) -> Float[Array, "*n 12"]:
         """Poses as vectors whose distance is about that of points on the surface (the chord of R, at the reach)."""
-        chord = self.body.reach_m / 2**0.5 * rotation.reshape(*rotation.shape[:-2], 9)
+        chord = self.reach_m / 2**0.5 * rotation.reshape(*rotation.shape[:-2], 9)
         return np.concatenate([position_m, chord], -1)
 
 

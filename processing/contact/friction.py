@@ -65,19 +65,30 @@ def friction_by_forecasts(
     body: RigidBody, tracks: Sequence[PoseSeries], smoothed: Sequence[Smoothed], seed: int = 0
 ) -> ForecastFriction | None:
     """Friction of a body of known shape. None where fewer than LEAST_TOSSES tosses hit the plane."""
-    found = [course for t, s in zip(tracks, smoothed) if (course := _course(t, s)) is not None]
-    if len(found) < LEAST_TOSSES:
+    courses = courses_of(tracks, smoothed)
+    if len(courses) < LEAST_TOSSES:
         return None
-    courses = [found[i] for i in np.unique(np.linspace(0, len(found) - 1, MOST_TOSSES).round().astype(int))]
-    noise = Noise(*(float(np.median([getattr(s.noise, n) for s in smoothed])) for n in ("position_m", "rotation_rad")))
-    forecasts = Forecasts(courses, body, noise)
+    forecasts = Forecasts(courses, body, noise_of(smoothed))
     law = _search(forecasts)
     tried = np.exp(np.log(law.friction) + PROFILE)
     profile = forecasts.scores([replace(law, friction=float(f)) for f in tried])
-    value = float(np.exp(np.log(law.friction) + _lowest(PROFILE, profile.sum(1))))
+    value = float(np.exp(np.log(law.friction) + lowest(PROFILE, profile.sum(1))))
     sampling = _sampling(profile, np.random.default_rng(seed)) * value
     half_width = float(np.hypot(sampling, 1.96 * MODEL_SHARE * value))
     return ForecastFriction(value, half_width, replace(law, friction=value), profile)
+
+
+def courses_of(tracks: Sequence[PoseSeries], smoothed: Sequence[Smoothed]) -> list[Course]:
+    """At most MOST_TOSSES of the tosses that hit anything, spread over all."""
+    found = [course for t, s in zip(tracks, smoothed) if (course := _course(t, s)) is not None]
+    if not found:
+        return []
+    return [found[i] for i in np.unique(np.linspace(0, len(found) - 1, MOST_TOSSES).round().astype(int))]
+
+
+def noise_of(smoothed: Sequence[Smoothed]) -> Noise:
+    """The noise of the typical toss."""
+    return Noise(*(float(np.median([getattr(s.noise, n) for s in smoothed])) for n in ("position_m", "rotation_rad")))
 
 
 def _course(track: PoseSeries, smoothed: Smoothed) -> Course | None:
@@ -99,7 +110,7 @@ def _search(forecasts: Forecasts) -> Law:
     for span in SPANS:
         logs = np.log(law.friction) + 2 * span * sides
         at = forecasts.scores([replace(law, friction=float(np.exp(x))) for x in logs]).sum(1)
-        law = replace(law, friction=float(np.exp(_lowest(logs, at))))
+        law = replace(law, friction=float(np.exp(lowest(logs, at))))
         tried = [replace(law, restitution=float(np.clip(law.restitution + x, 0, 0.9))) for x in span * sides]
         law = tried[int(forecasts.scores(tried).sum(1).argmin())]
         shares = np.clip(law.unexplained * np.exp(3 * span * sides), 0.01, 0.6)
@@ -108,7 +119,7 @@ def _search(forecasts: Forecasts) -> Law:
     return law
 
 
-def _lowest(x: Float[Array, " f"], y: Float[Array, " f"]) -> float:
+def lowest(x: Float[Array, " f"], y: Float[Array, " f"]) -> float:
     """Where a curve on an even grid is lowest: the parabola through the least entry and its neighbours."""
     i = int(np.clip(y.argmin(), 1, len(y) - 2))
     before, here, after = y[i - 1 : i + 2]
@@ -122,5 +133,5 @@ def _sampling(profile: Float[Array, "f n"], rng: np.random.Generator) -> float:
     """Half the 95 % interval of log friction, from drawing the tosses anew."""
     n = profile.shape[1]
     drawn = rng.multinomial(n, np.full(n, 1 / n), REPEATS)
-    spread = float(np.std([_lowest(PROFILE, profile @ counts) for counts in drawn], ddof=1))
+    spread = float(np.std([lowest(PROFILE, profile @ counts) for counts in drawn], ddof=1))
     return float(student.ppf(0.975, n - 1)) * spread * (n / (n - 1)) ** 0.5

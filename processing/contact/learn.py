@@ -28,6 +28,7 @@ from processing.contact.intervals import (
 from processing.contact.loss import REFERENCE_MASS_KG, Body, StepData, Weights, contact_loss
 from processing.contact.motion import PoseSeries, Steps
 from processing.contact.plane import Plane
+from processing.contact.plane_forecast import plane_by_forecasts
 from processing.contact.prepared import Prepared, no_contact, prepare, starts, transitions
 from processing.contact.prior import Frame, Prior, learned_shape
 from processing.contact.touch import plane_by_touch
@@ -140,6 +141,7 @@ def learn_contact(
     slow = slow_friction(fitted, optimum, prepared, config)
     cpu_seconds = time.process_time() - started
     progress.step(3, 6, "fitted")
+    found |= _slow_plane(fitted, optimum, prepared, prior, slow, config.seed)
     spread = _spread(fitted, optimum, data, weights, config, len(prepared.tracks))
     progress.step(4, 6, "intervals")
     sensitivity = plane_sensitivity(fitted, optimum, data, weights)
@@ -253,12 +255,36 @@ def slow_friction(
     """The friction by forecasts where it is better than the loss's; None where it is not, or not asked for."""
     if config.weights is not None or not config.friction_by_forecasts or not frames_are_slow(prepared.tracks):
         return None
+    rigid, tracks = _as_rigid(fitted, optimum, prepared)
+    return friction_by_forecasts(rigid, tracks, prepared.smoothed, config.seed)
+
+
+def _as_rigid(fitted: Model, optimum: Float[Array, " p"], prepared: Prepared) -> tuple[RigidBody, list[PoseSeries]]:
+    """The learned body about its centre of mass, and the tracks of that point above the plane."""
     body = fitted.numbers(optimum)
     center, inertia = body.center_m.cpu().numpy(), body.inertia_kgm2.cpu().numpy()
-    points = body.points_m.cpu().numpy() - center
     tracks = [t.about(center).turned(np.eye(3), float(body.plane_m)) for t in prepared.tracks]
-    rigid = RigidBody(points, fitted.geometry.contacts, inertia)
-    return friction_by_forecasts(rigid, tracks, prepared.smoothed, config.seed)
+    return RigidBody(body.points_m.cpu().numpy() - center, fitted.geometry.contacts, inertia), tracks
+
+
+def _slow_plane(
+    fitted: Model,
+    optimum: Float[Array, " p"],
+    prepared: Prepared,
+    prior: Prior,
+    slow: ForecastFriction | None,
+    seed: int,
+) -> dict[str, float | None]:
+    """The plane's height where frames are too far apart for touches: of a box of unknown size, by forecasts. Raises
+    BadInput as check_touched_plane does."""
+    if slow is None or prior.measured or fitted.geometry.name != "box":
+        return {}
+    rigid, tracks = _as_rigid(fitted, optimum, prepared)
+    plane = plane_by_forecasts(rigid, tracks, prepared.smoothed, slow.law, seed)
+    if plane is None:
+        return {}
+    checks.check_touched_plane(plane.height_m, plane.std_m)
+    return {"plane_by_touch_m": plane.height_m, "plane_by_touch_std_m": plane.std_m}
 
 
 def with_friction(done: Fit, spread: Spread, slow: ForecastFriction | None) -> tuple[Fit, Spread]:
