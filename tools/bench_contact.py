@@ -1,6 +1,6 @@
 """Contact learning against the figures of its issue: accuracy, CPU seconds, intervals, other shapes.
 
-python tools/bench_contact.py [CASE...]      # box16 box64 hull16 noise one shapes plane plane30 variety; all by default
+python tools/bench_contact.py [CASE...]      # box16 box64 hull16 noise one shapes variety; all by default
 
 Needs the real cube tosses: TOSSLAB_DATA/contactnets/tosses_processed. One thread; CPU seconds, not wall time.
 """
@@ -19,17 +19,13 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np
 import torch
 
-from processing.contact import data_checks as checks
 from processing.contact.evaluate import evaluate
 from processing.contact.from_tracks import learn_from_series
-from processing.contact.geometry import CORNERS
 from processing.contact.inertia import Physics, known_physics, uniform_physics
 from processing.contact.learn import ContactConfig, ContactLearning, learn_contact
 from processing.contact.motion import PoseSeries, rotation_matrices
 from processing.contact.plane import Plane
 from processing.contact.prior import Prior, prior_from_shape, prior_from_size
-from processing.contact.segment import find_phases
-from processing.contact.touch import TouchedPlane, plane_by_touch
 from recordings.errors import BadInput
 from recordings.tracks import ObjectShape
 
@@ -295,101 +291,6 @@ def held(shape: ObjectShape, physics: Physics, rng: np.random.Generator) -> Prio
     return replace(prior, sigma_m=np.full(len(prior.geometry.start()) // 3, 0.002))
 
 
-SHIFTS_M = (-0.012, -0.008, -0.006, 0.0, 0.006, 0.008, 0.012)
-
-
-def plane() -> None:
-    """How far the plane seems to be off where tosses are moved up by SHIFTS_M, and what is said of it: by touches of
-    real tosses (0-199 chose the limits, 200-399 did not) and of simulated bodies (seed 11 chose, 29 did not), by
-    forecasts at 30 Hz (`plane30`)."""
-    for start in (0, 200):
-        groups = [there(range(i, i + 16)) for i in range(start, start + 200, 16)]
-        _said(f"real {start}-{start + 199}", [[toss(n) for n in g] for g in groups if len(g) >= 8])
-    for seed, settings in (
-        (11, ((0.002, 1.0, 0.25), (0.006, 1.0, 0.15), (0.002, 0.3, 0.4))),
-        (29, ((0.003, 1.0, 0.3), (0.005, 0.6, 0.18), (0.0015, 0.4, 0.5))),
-    ):
-        for kind in ("sharp", "rounded by 4 mm"):
-            made = []
-            for pieces, truth in _plane_bodies(kind):
-                shape = ObjectShape("object", "truth", np.asarray(truth.vertices), np.asarray(truth.faces, np.int64))
-                physics = uniform_physics(shape, 0.37)
-                for soft_s, damping, mu in settings:
-                    tracks = simulated(pieces, physics, mu, 16, seed, soft_s, damping)
-                    made.append([t.about(physics.center_of_mass_m) for t in tracks])
-            _said(f"{kind}, seed {seed}", made)
-
-
-def _plane_bodies(kind: str) -> list[tuple[list[object], object]]:
-    """Boxes, a prism, a half cylinder and an L; or a cube with rounded edges."""
-    import trimesh
-
-    if kind != "sharp":
-        ball = trimesh.creation.icosphere(subdivisions=2, radius=0.004).vertices
-        made = trimesh.convex.convex_hull(np.concatenate([ball + 0.0484 * c for c in CORNERS]))
-        return [([made], made)]
-    angle = np.linspace(0, np.pi, 17)
-    triangle = np.array([[-0.036, 0.0], [0.036, 0.0], [0.0, 0.0716]])
-    whole = [block(-np.array(h), h) for h in ((0.05, 0.05, 0.05), (0.03, 0.045, 0.065), (0.02, 0.05, 0.06))]
-    whole += [prism(triangle, 0.1), prism(0.04 * np.stack([np.cos(angle), np.sin(angle)], 1), 0.1)]
-    ell = [block((0, 0, 0), (0.12, 0.04, 0.05)), block((0, 0.04, 0), (0.04, 0.1, 0.05))]
-    return [([w], w) for w in whole] + [(ell, l_mesh())]
-
-
-def _said(case: str, groups: Sequence[Sequence[PoseSeries]]) -> None:
-    """Readings at no shift, and counts of what is said at each shift."""
-    right = []
-    for shift_m in SHIFTS_M:
-        counts = dict.fromkeys(("refused", "below", "above", "nothing", "unknown"), 0)
-        for tracks in groups:
-            moved = [t.turned(np.eye(3), -shift_m) for t in tracks]
-            releases = [find_phases(t, CUBE.inertia_kgm2).release or 0 for t in moved]
-            found = plane_by_touch(moved, releases)
-            counts[_verdict(found)] += 1
-            if shift_m == 0 and found is not None:
-                right.append(1e3 * found.height_m)
-        line("plane", f"{case}, moved {1e3 * shift_m:+.0f} mm: " + ", ".join(f"{n} {w}" for w, n in counts.items()))
-    line("plane", f"{case}, not moved: reads {np.mean(right):.1f} +- {np.std(right):.1f} mm, {np.round(right, 1)}")
-
-
-def _verdict(found: TouchedPlane | None) -> str:
-    if found is None:
-        return "unknown"
-    said = checks.plane_warning(found.height_m, found.std_m)
-    try:
-        checks.check_touched_plane(found.height_m, found.std_m)
-    except BadInput:
-        return "refused"
-    return "nothing" if said is None else "below" if "mm below" in said else "above"
-
-
-def plane30() -> None:
-    """The same at 30 Hz with noise of 1 mm and .5 deg, of boxes, by forecasts: real tosses and simulated ones."""
-    cases = [(f"real {g}..", [toss(n) for n in there(range(g, g + 10))], CUBE) for g in (0, 100, 200, 300)]
-    for half in ((0.04, 0.04, 0.04), (0.035, 0.04, 0.055)):
-        body = block(-np.array(half), half)
-        shape = ObjectShape("object", "truth", np.asarray(body.vertices), np.asarray(body.faces, np.int64))
-        physics = uniform_physics(shape, 0.37)
-        cases.append((f"box {half}", simulated([body], physics, 0.3, 10, 29, 0.003), physics))
-    for name, tracks, physics in cases:
-        for shift_m in (-0.008, 0.0, 0.008):
-            made = [noisy(t, 5, 1e-3, np.radians(0.5), 0).turned(np.eye(3), -shift_m) for t in tracks]
-            config = ContactConfig(bootstrap_repeats=2)
-            try:
-                found = learn_contact(made, prior_from_size("box", 0.05), physics, config=config).checks
-            except BadInput as wrong:
-                line("plane30", f"{name}, moved {1e3 * shift_m:+.0f} mm: refused: {wrong}")
-                continue
-            height_m, std_m = found["plane_by_touch_m"], found["plane_by_touch_std_m"]
-            said = checks.plane_warning(height_m, std_m)
-            where = "nothing" if said is None else "below" if "mm below" in said else "above"
-            line(
-                "plane30",
-                f"{name}, moved {1e3 * shift_m:+.0f} mm: {1e3 * (height_m or np.nan):.1f} +- "
-                f"{1e3 * (std_m or np.nan):.1f} mm, said: {where}",
-            )
-
-
 def shapes() -> None:
     """Prism, half cylinder (hull) and L-shape (nonconvex) simulated with friction .25, from a prior 6 % too big."""
     angle = np.linspace(0, np.pi, 17)
@@ -460,8 +361,6 @@ CASES: dict[str, Callable[[], None]] = {
     "noise": noise,
     "one": one,
     "shapes": shapes,
-    "plane": plane,
-    "plane30": plane30,
     "variety": variety,
 }
 

@@ -29,7 +29,7 @@ PLANE_TOLERANCE_M = 0.005
 PLANE_BY_TOUCH_M = (-0.002, 0.005)
 """Where a right plane may be by the touches (touch.py): 0 for sharp edges, and above it by the radius of rounded ones
 (the real cubes of ContactNets: 2 to 3 mm, theirs are rounded by 4 and their plane is 1.2 mm low). Chosen on simulated
-bodies and half of the real tosses (tools/bench_contact.py plane)."""
+bodies and half of the real tosses (tools/bench_plane.py)."""
 SURE_STD = 2.0
 FALL_FRAMES = (20, 14, 10, 7, 5, 4)
 LONGEST_FALL_S = 0.2

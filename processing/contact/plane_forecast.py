@@ -28,7 +28,7 @@ LEAST_HALF_M = 0.005
 REPEATS = 200
 MODEL_STD_M = 0.0025
 """What stays with any number of tosses: readings of six simulated bodies and two real groups are that far off where
-their own spread is small (tools/bench_contact.py plane30)."""
+their own spread is small (tools/bench_plane.py forecast)."""
 
 
 def plane_by_forecasts(
