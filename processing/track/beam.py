@@ -16,7 +16,7 @@ from numpy import ndarray as Array
 from processing.track import kernels as k
 from processing.track.features import FeatureMatcher, Features, RansacConfig, relative_motions
 from processing.track.keyframes import KeyframeConfig, is_new, references
-from processing.track.motion import MotionConfig, change_cost, moved, steady_spin, turn_between
+from processing.track.motion import MotionConfig, carried_on, change_cost, moved, steady_spin, turn_between
 from processing.track.views import ViewStore
 from recordings.geometry import rotation_exp
 
@@ -146,7 +146,7 @@ def follow(
         if not scene.store.usable(i):
             beam = [_without(h, i) for h in beam]
             continue
-        _put_at_color_time(scene, beam[0], i)
+        _put_at_color_time(scene, beam[0], i, config)
         grown: list[Hypothesis] = []
         for h in beam:
             kept, others = _branches(scene, h, i, config)
@@ -159,8 +159,9 @@ def follow(
     return Followed(beam[0], float(margin), rejected)
 
 
-def _put_at_color_time(scene: Scene, h: Hypothesis, i: int) -> None:
-    """Where depth is exposed at another time than colour: make the view with the motion that the poses foretell."""
+def _put_at_color_time(scene: Scene, h: Hypothesis, i: int, config: BeamConfig) -> None:
+    """Where depth is exposed at another time than colour: make the view with the motion that the poses foretell, then
+    with the motion to the pose that fits it best."""
     crop, tracked = scene.store.crops[i], [j for j in h.tracked if j != i]
     if crop is None or abs(crop.depth_delay_s) < LEAST_DELAY_S or len(tracked) < 2 or np.isfinite(h.poses[i, 0, 0]):
         return
@@ -176,6 +177,11 @@ def _put_at_color_time(scene: Scene, h: Hypothesis, i: int) -> None:
         for t in (scene.times_s[i], scene.times_s[i] + crop.depth_delay_s)
     )
     scene.store.fill(i, color @ k.inverse(depth))
+    found = _aligned_all(scene, h, i, _usual_starts(scene, h, i), config)
+    if found and found[0].fit < config.lost:
+        three = np.array([h.poses[tracked[-2]], h.poses[b], found[0].pose])
+        times_s = scene.times_s[[tracked[-2], b, i]]
+        scene.store.fill(i, k.inverse(carried_on(three, times_s, crop.depth_delay_s, scene.center_m)))
 
 
 def started(store: ViewStore, count: int, view: int, pose: Float[Array, "4 4"]) -> Hypothesis:

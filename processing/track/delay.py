@@ -8,7 +8,7 @@ from numpy import ndarray as Array
 
 from processing.track import kernels as k
 from processing.track.beam import LEAST_DELAY_S, Scene
-from processing.track.motion import between
+from processing.track.motion import between, turn_between
 
 IMPACT_M_S = 0.35
 """A change of velocity around a frame beyond this is an impact."""
@@ -49,6 +49,28 @@ def _at_depth_time(
     out = _carried(poses[i], turn, poses[x], poses[y], float(share), scene.center_m)
     if not hit and _falls(scene, poses, (int(before), int(i), int(after))):
         out[:3, 3] += 0.5 * scene.gravity_camera_m_s2 * delay_s**2
+    return out
+
+
+def unknown_motion(
+    scene: Scene, poses: Float[Array, "n 4 4"], use: Bool[Array, " n"]
+) -> Float[Array, "n 6 6"]:  # fmt: skip
+    """Covariance (twist of the object frame, translation first) of depth that was exposed on the other side of an
+    impact, or may have been: half of the jump of velocity and spin, over the delay."""
+    out, index, t = np.zeros((len(poses), 6, 6)), np.flatnonzero(use), scene.times_s
+    for before, i, after in zip(index, index[1:], index[2:]):
+        crop = scene.store.crops[i]
+        if crop is None or abs(crop.depth_delay_s) < LEAST_DELAY_S:
+            continue
+        centers = [poses[z][:3, :3] @ scene.center_m + poses[z][:3, 3] for z in (before, i, after)]
+        speed = (centers[2] - centers[1]) / (t[after] - t[i]) - (centers[1] - centers[0]) / (t[i] - t[before])
+        if np.linalg.norm(speed) < 2 * IMPACT_M_S:
+            continue
+        spin = turn_between(poses[after], poses[i]) / (t[after] - t[i])
+        spin = spin - turn_between(poses[i], poses[before]) / (t[i] - t[before])
+        half_s = 0.5 * crop.depth_delay_s
+        moved = (float(np.linalg.norm(speed * half_s)), float(np.linalg.norm(spin * half_s)))
+        out[i] = np.diag([moved[0] ** 2 / 3] * 3 + [moved[1] ** 2 / 3] * 3)
     return out
 
 

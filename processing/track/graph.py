@@ -31,8 +31,12 @@ class GraphConfig:
     loops: int = 6
     """Views from near directions, whatever their time, that a view is compared with."""
     co_visible_deg: float = 50.0
+    least_loops: int = 2
+    wide_deg: float = 70.0
+    """A view with fewer loops takes some from directions so far apart: they err more, but a chain drifts."""
     spread_in_time: int = 3
-    """Of frames nearer to each other in time than this, only one is taken for loops."""
+    """Of frames nearer to each other in time than this, or between which the object stands still, only one is taken for
+    loops."""
     schedule: Schedule = (
         (1, 2, 0.006, 0.4, 0.008, 0.3),
         (0, 3, 0.004, 0.4, 0.006, 0.5),
@@ -89,13 +93,15 @@ class Refined:
 
 def choose_pairs(
     poses: Float[Array, "n 4 4"], use: Bool[Array, " n"], toss: Int[Array, " n"], center_m: Float[Array, "3"],
-    config: GraphConfig,
+    still: Bool[Array, " n"], config: GraphConfig,
 ) -> Int[Array, "m 2"]:  # fmt: skip
-    """Pairs (i, k), both ways: neighbours in time, and views from near directions spread over time and tosses."""
+    """Pairs (i, k), both ways: neighbours in time, and views from near directions spread over time and tosses. `still`:
+    whether the object stands still between each view and the one before it."""
     index = np.flatnonzero(use)
     directions = view_directions(poses[index], center_m)
     cosine = np.clip(directions @ directions.T, -1, 1)
     chosen: set[tuple[int, int]] = set()
+    stay = np.cumsum(~still)
     for a, i in enumerate(index):
         later = [int(j) for j in index[a + 1 : a + 1 + config.neighbours] if toss[j] == toss[i]]
         taken = [int(i), *later]
@@ -103,9 +109,10 @@ def choose_pairs(
         wanted = config.loops
         for b in np.argsort(-cosine[a]):
             j = int(index[b])
-            if wanted == 0 or cosine[a, b] < np.cos(np.radians(config.co_visible_deg)):
+            few = config.loops - wanted < config.least_loops
+            if wanted == 0 or cosine[a, b] < np.cos(np.radians(config.wide_deg if few else config.co_visible_deg)):
                 break
-            if any(toss[j] == toss[t] and abs(j - t) < config.spread_in_time for t in taken):
+            if any(toss[j] == toss[t] and (abs(j - t) < config.spread_in_time or stay[j] == stay[t]) for t in taken):
                 continue
             taken.append(j)
             chosen.add((min(int(i), j), max(int(i), j)))
@@ -127,7 +134,7 @@ def refine(
     """All poses in `use` at once; those in `fixed` stay. `poses` of other views are returned as they are. No pose moves
     along the twist `held`, where there is one. A round body's profile is solved with them."""
     poses = poses.copy()
-    pairs = choose_pairs(poses, use, motion.toss, motion.center_m, config)
+    pairs = choose_pairs(poses, use, motion.toss, motion.center_m, motion.still, config)
     pairs = pairs[~fixed[pairs].all(1)]
     distance = float(np.median(np.linalg.norm(store.center_m[use], axis=1)))
     free = np.flatnonzero(use & ~fixed)

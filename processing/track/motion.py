@@ -12,6 +12,9 @@ from numpy import ndarray as Array
 from recordings.geometry import rotation_exp, rotation_log
 
 GRAVITY_M_S2 = 9.81
+IMPACT_M_S = 0.5
+IMPACT_RAD_S = 5.0
+"""A change of velocity and of spin from frame to frame beyond this is an impact's."""
 
 
 @dataclass(frozen=True)
@@ -74,6 +77,26 @@ def moved(
     x0, x1 = (p[:3, :3] @ center_m + p[:3, 3] for p in (before, now))
     center = x1 + (x1 - x0) * ratio + gravity_camera_m_s2 * (0.5 * next_s * (step_s + next_s))
     out[:3, 3] = center - out[:3, :3] @ center_m
+    return out
+
+
+def carried_on(
+    poses: Float[Array, "3 4 4"], times_s: Float[Array, "3"], delay_s: float, center_m: Float[Array, "3"]
+) -> Float[Array, "4 4"]:
+    """The motion (camera axes) of the last of three poses over `delay_s`: spin and velocity go on changing as they
+    did, but for an impact's jump."""
+    steps_s = np.diff(times_s)
+    spins = [turn_between(poses[j + 1], poses[j]) / steps_s[j] for j in (0, 1)]
+    centers = [p[:3, :3] @ center_m + p[:3, 3] for p in poses]
+    speeds = [(centers[j + 1] - centers[j]) / steps_s[j] for j in (0, 1)]
+    ahead = (steps_s[1] + delay_s) / (steps_s[0] + steps_s[1])
+    spin, speed = (
+        last + ahead * (last - first) if np.linalg.norm(last - first) < impact else last
+        for (first, last), impact in ((spins, IMPACT_RAD_S), (speeds, IMPACT_M_S))
+    )
+    out = np.eye(4)
+    out[:3, :3] = rotation_exp(spin * delay_s)
+    out[:3, 3] = centers[2] + speed * delay_s - out[:3, :3] @ centers[2]
     return out
 
 

@@ -14,6 +14,7 @@ from numpy import ndarray as Array
 
 from processing.track import kernels as k
 from processing.track.beam import BeamConfig, Candidate, Hypothesis, Scene, follow, started
+from processing.track.delay import unknown_motion
 from processing.track.exposure import Exposure
 from processing.track.features import FeatureMatcher, Sift
 from processing.track.flags import FlagConfig, doubt, flagged, per_view
@@ -339,8 +340,9 @@ def _told(
         twist = best.turned.axis.twist
         twists = twists + best.turned.sigma_rad[:, None, None] ** 2 * np.outer(twist, twist)
     for other in stories[1:]:
-        apart = other.badness - best.badness
+        apart = other.total - best.total
         twists = twists + doubt(joint.poses[:n], other.joint.poses[:n], apart, config.flags)
+    twists = twists + unknown_motion(scene, joint.poses[:n], best.use)
     poses, status, covariance = flagged(joint.poses[:n], twists, lost, scene, config.flags)
     times_ns = np.array([f.time_ns for f in frames], dtype=np.int64)
     track = ObjectTrack(toss, camera, object_frame, times_ns, poses, status, covariance)
@@ -348,5 +350,5 @@ def _told(
     pairs = joint.pairs[(joint.pairs < n).all(1)]
     for other in stories[1:]:
         if apart_deg(joint.poses[:n], other.joint.poses[:n]) > config.story.agreeing_deg:
-            margin = min(margin, other.badness - best.badness)
+            margin = min(margin, other.total - best.total)
     return TossTrack(track, cost, on, keyframes, pairs, rejected, best.center_m, margin, scene.store)

@@ -10,6 +10,7 @@ from numpy import ndarray as Array
 
 from processing.track.beam import LEAST_DELAY_S, Hypothesis, Scene
 from processing.track.delay import put_at_color_times
+from processing.track.evidence import EvidenceConfig, evidence
 from processing.track.flags import per_view
 from processing.track.graph import GraphConfig, Motion, Refined, refine, steady_motion
 from processing.track.middle import center_of_mass
@@ -28,6 +29,11 @@ class StoryConfig:
     """Refinement that trusts steady motion more than what the images say."""
     agreeing_deg: float = 4.0
     """Two stories of the same frames that differ by less are one."""
+    evidence: EvidenceConfig = field(default_factory=EvidenceConfig)
+    nat: float = 0.0015
+    """Badness that one nat of evidence by looks is worth."""
+    impacts: float = 0.1
+    """Share of the frames in which stories may differ without leaving a turn open: blurred ones at impacts."""
     motion: MotionConfig = field(default_factory=MotionConfig)
     turns: TurnConfig = field(default_factory=TurnConfig)
     round_body: GraphConfig = field(default_factory=lambda: GraphConfig(round_body=True))
@@ -52,6 +58,12 @@ class Story:
     turned: Turned | None = None
     axis: Axis | None = None
     """Of a round body, all of whose views were laid onto one profile."""
+    against: float = 0.0
+    """What the looks say against it, beside the story that fits best, in units of badness."""
+
+    @property
+    def total(self) -> float:
+        return self.badness + self.against
 
 
 def settled(scene: Scene, stories: list[Hypothesis], first: int, keep_first: bool, config: StoryConfig) -> list[Story]:
@@ -66,11 +78,22 @@ def settled(scene: Scene, stories: list[Hypothesis], first: int, keep_first: boo
     sought = _sought(scene, out, first, keep_first, config) if len(stories) > 1 else None
     if sought is not None:
         return _again([sought], scene, first, keep_first, replace(config, graph=config.round_body))
-    if not agree:
+    out = _heard(scene, out, config)
+    if not agree and any(_leave_open(out[0].joint.poses[:n], s.joint.poses[:n], config) for s in out[1:]):
         steady = replace(config, graph=config.steady)
         smooth = refined(scene, replace(out[0].told, poses=out[0].joint.poses), first, keep_first, steady)
         out.append(refined(scene, replace(smooth.told, poses=smooth.joint.poses), first, keep_first, config))
-    return _again(sorted(out, key=lambda s: s.badness), scene, first, keep_first, config)
+    return _again(_heard(scene, out, config), scene, first, keep_first, config)
+
+
+def _heard(scene: Scene, stories: list[Story], config: StoryConfig) -> list[Story]:
+    """Best first, what the looks say of each against the one that fits best added to how badly it fits."""
+    n, best = len(scene.times_s), min(stories, key=lambda s: s.badness)
+    out = [replace(best, against=0.0)]
+    for s in (s for s in stories if s is not best):
+        nats = evidence(scene, best.joint.poses[:n], s.joint.poses[:n], best.use & s.use, config.evidence)
+        out.append(replace(s, against=config.nat * nats))
+    return sorted(out, key=lambda s: s.total)
 
 
 def _sought(scene: Scene, stories: list[Story], first: int, keep_first: bool, config: StoryConfig) -> Story | None:
@@ -101,25 +124,36 @@ def _contradiction(scene: Scene, story: Story, found: Turned, config: StoryConfi
 
 
 def _again(stories: list[Story], scene: Scene, first: int, keep_first: bool, config: StoryConfig) -> list[Story]:
-    """The best story once more where depth and colour differ in time: its motion is known better now."""
+    """The best story once more, finely, where depth and colour differ in time: its motion is known better now."""
     if not _delayed(scene):
         return stories
     best = replace(stories[0].told, poses=stories[0].joint.poses)
     found = stories[0].turned
     axis = stories[0].axis
-    again = refined(scene, best, first, keep_first, config, axis, held=found is not None)
-    return [replace(again, turned=found), *stories[1:]]
+    fine = replace(config, graph=replace(config.graph, schedule=config.graph.schedule[-1:]))
+    again = refined(scene, best, first, keep_first, fine, axis, held=found is not None)
+    return [replace(again, turned=found, against=stories[0].against), *stories[1:]]
 
 
 def _delayed(scene: Scene) -> bool:
     return any(c is not None and abs(c.depth_delay_s) > LEAST_DELAY_S for c in scene.store.crops)
 
 
+def _leave_open(one: Float[Array, "n 4 4"], other: Float[Array, "n 4 4"], config: StoryConfig) -> bool:
+    """Whether two stories differ in more frames than an impact blurs: then the images leave a turn open."""
+    turns = _turns_deg(one, other)
+    return bool(np.mean(turns > config.agreeing_deg) > config.impacts) if len(turns) else False
+
+
+def _turns_deg(one: Float[Array, "n 4 4"], other: Float[Array, "n 4 4"]) -> Float[Array, " m"]:
+    """Turn between two stories' poses of each frame that both have."""
+    both = np.flatnonzero(np.isfinite(one[:, 0, 0]) & np.isfinite(other[:, 0, 0]))
+    return np.degrees([float(np.linalg.norm(turn_between(one[i], other[i]))) for i in both])
+
+
 def apart_deg(one: Float[Array, "n 4 4"], other: Float[Array, "n 4 4"]) -> float:
     """Largest turn between two stories' poses of a frame."""
-    both = np.flatnonzero(np.isfinite(one[:, 0, 0]) & np.isfinite(other[:, 0, 0]))
-    turns = [float(np.linalg.norm(turn_between(one[i], other[i]))) for i in both]
-    return float(np.degrees(max(turns, default=0.0)))
+    return float(max(_turns_deg(one, other), default=0.0))
 
 
 def refined(
