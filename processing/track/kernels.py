@@ -35,9 +35,8 @@ SAMPLE = 6 + 2 * LOOKS
 LEVEL, STEPS, GEOMETRY_M, INTENSITY, OUTLINE_M, SHARE, ROUND = range(7)
 """Columns of a schedule row: intensity channel (0 sharp, 1 smooth), steps, the three scales, share of the samples."""
 
-LEAST_SLOPE = 0.03
-"""Looks that change by less a pixel are shading, which stays with the room: they pull little."""
-LEAST_BRIGHT_SLOPE = 0.1
+LEAST_SLOPE, LEAST_BRIGHT_SLOPE = 0.03, 0.1
+"""Looks that change by less a pixel are shading, which stays with the room: they pull little; brightness above all."""
 GRAZING, FACING = 0.3, 0.8
 COVERED_COST = 0.12
 """Of a point that faces the other view but lies behind what is seen there: it may be covered."""
@@ -254,7 +253,7 @@ def pair_terms(samples, step, pose, maps, row, focal, center, level, s_geo, s_in
                     gu = (i10 - i00) * (1 - b) + (i11 - i01) * b
                     gv = bottom - top
                     slope = gu * gu + gv * gv
-                    least = LEAST_BRIGHT_SLOPE if round_body and c == 0 else LEAST_SLOPE
+                    least = LEAST_BRIGHT_SLOPE if c == 0 else LEAST_SLOPE
                     k = np.sqrt(trust) * (1.0 - r * r / 9.0) * slope / (slope + least * least)
                     gu *= fx * iz
                     gv *= fy * iz

@@ -31,6 +31,9 @@ class ViewConfig:
     """Depth off a plane by more than this share of the distance belongs to another surface."""
     smooth_px: float = 2.5
     """Blur of the smooth grey level, which widens the basin of attraction."""
+    rim_px: float = 2.0
+    """Looks so near to the outline are mixed with the background's (optics, chroma of JPEG): they would stay with the
+    picture, not with the object. Those farther inside are blurred outwards over them."""
     shade_px: float = 5.0
     """Scale over which brightness is levelled: shading and exposure are no texture."""
     bright_gain: float = 0.5
@@ -256,7 +259,8 @@ def _looks(crop: Crop, config: ViewConfig) -> Float32[Array, "h w 6"]:
     differences of colour, each sharp and smooth."""
     color, mask = crop.color, crop.mask
     foreign = None if crop.colorless is None else cv2.dilate(crop.colorless.astype(np.uint8), np.ones((3, 3))) > 0
-    weight = (mask if foreign is None else mask & ~foreign).astype(np.float32)
+    own = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, 5) > config.rim_px
+    weight = (own if foreign is None else own & ~foreign).astype(np.float32)
     red, green, blue = color[..., 0], color[..., 1], color[..., 2]
     gray = 0.299 * red + 0.587 * green + 0.114 * blue
     total = red + green + blue + 0.1
@@ -266,7 +270,7 @@ def _looks(crop: Crop, config: ViewConfig) -> Float32[Array, "h w 6"]:
         config.color_gain * (blue - 0.5 * (red + green)) / total,
     )
     smooth = [_masked_blur(look, weight, config.smooth_px) for look in looks]
-    sharp = [np.where(mask, look, blurred) for look, blurred in zip(looks, smooth)]
+    sharp = [np.where(own, look, blurred) for look, blurred in zip(looks, smooth)]
     out = np.stack([*sharp, *smooth], -1).astype(np.float32)
     if foreign is not None:
         out[foreign & mask] = k.NO_LOOK
