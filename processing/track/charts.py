@@ -16,6 +16,7 @@ from numpy import ndarray as Array
 from processing.track import kernels as k
 from processing.track.beam import Scene
 from processing.track.round_axis import Axis
+from processing.track.views import ViewStore
 
 
 @dataclass(frozen=True)
@@ -39,7 +40,11 @@ class ChartConfig:
     robust: float = 1.5
     """Residuals of the light beyond so many standard deviations belong to the object."""
     shine: float = 0.2
-    """A surface whose brightness is beyond the light's by this share, and its colour paler, mirrors a lamp."""
+    """A surface whose brightness is beyond the light's by this share, and its colour paler, mirrors a lamp ..."""
+    grey: float = 1.2
+    """... unless it is paler than this share of the way to grey."""
+    table_m: float = 0.006
+    """A place that lies deeper in the table is empty."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,10 +173,12 @@ def _without_light(seen: list[_Pixels], config: ChartConfig) -> list[tuple[Float
 
 
 def _shines(left: Float[Array, "p 3"], usual: Float[Array, "2"], config: ChartConfig) -> Bool[Array, " p"]:
-    """Where a lamp is mirrored: brighter than the light makes it, and its colour on the way to the lamp's (grey)."""
+    """Where a lamp is mirrored: brighter than the light makes it, and its colour on the way to the lamp's (grey), but
+    not beyond it: a label may be of the opposite colour."""
     size = np.linalg.norm(left[:, :2], axis=1) * np.linalg.norm(usual) + 1e-9
-    paler = -(left[:, :2] @ usual) > 0.9 * size
-    return np.asarray((left[:, 2] > config.shine) & paler)
+    paler = -(left[:, :2] @ usual)
+    on_the_way = (paler > 0.9 * size) & (paler < config.grey * (usual @ usual))
+    return np.asarray((left[:, 2] > config.shine) & on_the_way)
 
 
 def _profile(seen: list[_Pixels], low: float, high: float, config: ChartConfig) -> Float[Array, " h"]:
@@ -240,4 +247,21 @@ def _free(
     shown = (u >= 0) & (v >= 0) & (u < w) & (v < h)
     there = pixels[np.clip(v, 0, h - 1), np.clip(u, 0, w - 1)]
     through = (there[..., k.OUTSIDE] == 0) & (there[..., k.Z] > 0) & (there[..., k.Z] - q[..., 2] > config.beyond_m)
-    return np.asarray(~shown | (there[..., k.OUTSIDE] > config.beside_px) | through)
+    beside = ~shown | (there[..., k.OUTSIDE] > config.beside_px)
+    return np.asarray(beside | through | (_heights(store, view, q) < -config.table_m))
+
+
+def _heights(store: ViewStore, view: int, places: Float[Array, "q c 3"]) -> Float[Array, "q c"]:
+    """Height above the table of places in camera axes; infinite where the table is not known."""
+    crop = store.crops[view]
+    if crop is None or crop.height_m is None:
+        return np.full(places.shape[:-1], np.inf)
+    v, u = np.nonzero(crop.depth_m > 0)
+    some = slice(None, None, max(len(u) // 200, 1))
+    u, v = u[some], v[some]
+    focal, center = store.optics.focal, store.optics.center
+    rays = np.stack([(u + crop.corner[0] - center[0]) / focal[0], (v + crop.corner[1] - center[1]) / focal[1]], -1)
+    z = crop.depth_m[v, u].astype(np.float64)
+    seen = np.column_stack([rays * z[:, None], z, np.ones(len(z))])
+    plane = np.linalg.lstsq(seen, crop.height_m[v, u].astype(np.float64), rcond=None)[0]
+    return np.asarray(places @ plane[:3] + plane[3])

@@ -68,6 +68,12 @@ def steady_motion() -> GraphConfig:
     return GraphConfig(shared_noise=200.0, jerk_rad_s=0.1, schedule=(*rough, *GraphConfig().schedule[1:]))
 
 
+def round_views() -> GraphConfig:
+    """Settings for views that a round body's profile ties already: pairs of them, which drift, count little."""
+    fine = ((1, 2, 0.006, 0.4, 0.008, 0.3), (0, 4, 0.003, 0.15, 0.005, 0.3), (0, 6, 0.0035, 0.08, 0.005, 0.3))
+    return GraphConfig(round_body=True, shared_noise=100.0, schedule=fine)
+
+
 @dataclass(frozen=True, eq=False)
 class Motion:
     """What the pull towards free flight needs: times, gravity (camera axes), the body's middle (object frame),

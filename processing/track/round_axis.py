@@ -15,16 +15,14 @@ from recordings.geometry import rotation_exp
 
 @dataclass(frozen=True)
 class AxisConfig:
-    """When a body counts as round."""
+    """When a body may be round; whether it is, its outlines say (round_body.py)."""
 
     round_ratio: float = 0.2
     """A turn about which depth tells less than this share of what it tells about the next is open ..."""
-    round_share: float = 0.6
+    round_share: float = 0.45
     """... where so many normals meet the axis ..."""
-    round_cells: int = 14
-    """... and point in so many of 36 directions around it (a box's point in four) ..."""
-    round_both: float = 9.8
-    """... and both together (their product) say so: noisy normals that miss the axis are made up for by directions."""
+    round_cells: int = 10
+    """... and point in so many of 36 directions around it (a box's point in four; noisy ones in ten)."""
     meets: float = 0.1
     """A normal that passes the axis by less than this share of the body's size meets it."""
     facing: float = 0.5
@@ -78,8 +76,6 @@ def open_axis(scene: Scene, poses: Float[Array, "n 4 4"], use: Bool[Array, " n"]
     meeting = np.abs(gap) < 2 * config.meets
     share, cells = float(meeting.mean()), _directions_around(normals[meeting], direction)
     if told[0] > config.round_ratio * told[1] or share < config.round_share or cells < config.round_cells:
-        return None
-    if share * cells < config.round_both:
         return None
     return Axis(direction, _foot(middle + size * np.cross(direction, shift), direction))
 

@@ -52,10 +52,14 @@ class BodyConfig:
     """Points of the outline along the wall."""
     bias_px: float = 0.15
     """Standard deviation of what all masks are too large by, known beforehand ..."""
-    grown_m: float = 0.0007
+    grown_m: float = 0.0005
     """... and of a radius in outlines against one in depth."""
     bend_m: float = 0.0013
     """Usual bend of a profile from node to node, known for each four views."""
+    round_share: float = 0.4
+    """A body is round where so much of its outlines is that of a body of revolution (a box's: a quarter at most)."""
+    tries: int = 6
+    """Steps after which that is asked."""
     least_pixels: int = 12
     """A node that fewer samples saw is unknown."""
 
@@ -111,6 +115,12 @@ class RoundBody:
         """How far outlines lie off the profile's (root mean square; what stands off the body or covers it left out)."""
         counted, _, squared = self._outline.sum(0)
         return float(np.sqrt(squared / max(counted, 1)))
+
+    @property
+    def outline_share(self) -> float:
+        """How much of the outlines that a body of revolution would have is there."""
+        counted, looked_at, _ = self._outline.sum(0)
+        return float(counted / max(looked_at, 1))
 
     def _placed(self, i: int, pose: Float[Array, "4 4"]) -> tuple[Array, Array, Array]:
         """Height, distance from the axis and curve (-1: none) of a view's samples."""
@@ -201,6 +211,26 @@ class RoundBody:
             H[unknown, unknown] += views / usual**2
             g[unknown] += views * self._y[unknown] / usual**2
         H[np.diag_indices(len(g))] += 1e-6 * H.diagonal() + 1.0
+
+
+def is_round(
+    store: ViewStore, poses: Float[Array, "n 4 4"], use: Bool[Array, " n"], axis: Axis, config: BodyConfig
+) -> bool:
+    """Whether views show outlines of a body of revolution about this axis or nearly so, at nearly these poses."""
+    body, poses = RoundBody(store, poses, use, axis, config), poses.copy()
+    views = np.flatnonzero(use)
+    place = np.full(len(poses), -1)
+    place[views] = np.arange(len(views))
+    turn = np.kron(np.eye(len(views)), np.outer(axis.twist, axis.twist) / float(axis.twist @ axis.twist))
+    for _ in range(config.tries):
+        blocks, g = np.zeros((len(views), len(views), 6, 6)), np.zeros((len(views), 6))
+        body.add(blocks, g, poses, place)
+        H = blocks.transpose(0, 2, 1, 3).reshape(6 * len(views), -1)
+        H += np.diag(1e-6 * H.diagonal() + 1e-3) + 1e3 * np.trace(H) / len(H) * turn
+        for i, twist in zip(views, -np.linalg.solve(H, g.reshape(-1)).reshape(-1, 6)):
+            size = max(float(np.linalg.norm(twist[:3])) / 0.01, float(np.linalg.norm(twist[3:])) / 0.1, 1.0)
+            poses[i] = poses[i] @ k.inverse(k.exponential(twist / size))
+    return body.outline_share > config.round_share
 
 
 def _beside_px(store: ViewStore, views: Int[Array, " v"]) -> Float32[Array, " p"]:

@@ -12,11 +12,11 @@ from processing.track.beam import LEAST_DELAY_S, Hypothesis, Scene
 from processing.track.delay import put_at_color_times
 from processing.track.evidence import EvidenceConfig, evidence
 from processing.track.flags import per_view
-from processing.track.graph import GraphConfig, Motion, Refined, refine, steady_motion
+from processing.track.graph import GraphConfig, Motion, Refined, refine, round_views, steady_motion
 from processing.track.middle import center_of_mass
 from processing.track.motion import MotionConfig, change_cost, turn_between
 from processing.track.round_axis import Axis, open_axis
-from processing.track.round_body import BodyConfig, RoundBody, anchored
+from processing.track.round_body import BodyConfig, RoundBody, anchored, is_round
 from processing.track.turns import TurnConfig, Turned, contradiction, doubted, turned
 
 
@@ -36,11 +36,9 @@ class StoryConfig:
     """Share of the frames in which stories may differ without leaving a turn open: blurred ones at impacts."""
     motion: MotionConfig = field(default_factory=MotionConfig)
     turns: TurnConfig = field(default_factory=TurnConfig)
-    round_body: GraphConfig = field(default_factory=lambda: GraphConfig(round_body=True))
-    """Refinement of a round body whose looks do not tell its turn."""
+    round_body: GraphConfig = field(default_factory=round_views)
+    """Refinement of a round body, whose turn stays as it was found."""
     body: BodyConfig = field(default_factory=BodyConfig)
-    freed: float = 0.98
-    """That refinement may change the turns that were found where what speaks against them falls below this share."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,6 +100,8 @@ def _sought(scene: Scene, stories: list[Story], first: int, keep_first: bool, co
     axis = open_axis(scene, best.joint.poses[:n], best.use, config.turns.axis)
     if axis is None or len(scene.store) > n:
         return None
+    if not is_round(scene.store, best.joint.poses[:n], best.use, axis, config.body):
+        return None
     easy = replace(config, graph=config.round_body)
     straight = refined(scene, replace(best.told, poses=best.joint.poses), first, keep_first, easy, axis, held=True)
     assert straight.axis is not None
@@ -110,9 +110,8 @@ def _sought(scene: Scene, stories: list[Story], first: int, keep_first: bool, co
     if len(stories) == 1 and apart_deg(straight.joint.poses[:n], found.poses) < config.agreeing_deg:
         return refined(scene, replace(best.told, poses=straight.joint.poses), first, keep_first, config, straight.axis)
     told = replace(best.told, poses=found.poses)
-    both = [refined(scene, told, first, keep_first, easy, found.axis, held) for held in (True, False)]
-    held, free = (_contradiction(scene, s, found, config) for s in both)
-    kept, said = (both[1], free) if free < config.freed * held else (both[0], held)
+    kept = refined(scene, told, first, keep_first, easy, found.axis, held=True)
+    said = _contradiction(scene, kept, found, config)
     if len(stories) == 1 and _contradiction(scene, straight, found, config) < said:
         return refined(scene, replace(best.told, poses=straight.joint.poses), first, keep_first, config, straight.axis)
     return replace(kept, turned=doubted(replace(found, axis=kept.axis or axis), said, first, config.turns))
