@@ -7,7 +7,7 @@ import pytest
 
 from processing.track import kernels as k
 from processing.track.round_axis import Axis
-from processing.track.round_body import BodyConfig, RoundBody, anchored
+from processing.track.round_body import BodyConfig, RoundBody, anchored, is_round
 from processing.track.views import Crop, Optics, ViewConfig, ViewStore
 from recordings.geometry import CameraModel, rotation_exp
 
@@ -118,6 +118,13 @@ def test_right_poses_show_the_body_as_large_as_it_is(cans: tuple[ViewStore, np.n
     assert high - low == pytest.approx(2 * HALF_M, abs=1e-3)
     assert body.radius_m == pytest.approx(RADIUS_M, abs=5e-4)
     assert body.outline_rms_px < 0.4
+
+
+def test_outlines_say_whether_a_body_is_round_about_an_axis(cans: tuple[ViewStore, np.ndarray]) -> None:
+    store, truth = cans
+    every = np.ones(len(truth), dtype=bool)
+    assert is_round(store, truth, every, AXIS, BodyConfig())
+    assert not is_round(store, truth, every, Axis(np.array([1.0, 0.0, 0.0]), np.zeros(3)), BodyConfig())
 
 
 def test_an_anchored_view_keeps_its_pose_and_the_axis_its_place_in_space() -> None:

@@ -8,12 +8,12 @@ import pytest
 from processing.track import kernels as k
 from processing.track import turn_kernels as tk
 from processing.track.beam import Scene
-from processing.track.charts import Charts
+from processing.track.charts import ChartConfig, Charts, _heights, _shines
 from processing.track.features import Sift
 from processing.track.round_axis import Axis, AxisConfig, open_axis
 from processing.track.steady_turns import Pace, SteadyConfig, steadied
 from processing.track.turns import TurnConfig, Turned, _usual, doubted
-from processing.track.views import Optics, ViewConfig, ViewStore
+from processing.track.views import Crop, Optics, ViewConfig, ViewStore
 from recordings.geometry import CameraModel, rotation_exp
 
 CAMERA = CameraModel("d455", 640, 480, np.array([[386.0, 0, 320], [0, 386, 240], [0, 0, 1]]))
@@ -156,3 +156,25 @@ def test_what_contradicts_the_poses_widens_the_doubt() -> None:
     sure, unsure = (doubted(found, config.usual * times, 0, config).sigma_rad for times in (0.5, 4.0))
     np.testing.assert_allclose(np.degrees(sure), [0, 10, 10])
     np.testing.assert_allclose(np.degrees(unsure), [0, 40, 40])
+
+
+def test_a_lamp_makes_a_colour_paler_but_not_the_opposite_one() -> None:
+    usual = np.array([0.8, -0.2])
+    brighter = 0.5
+    lamp, label, shade = -0.7 * usual, -1.6 * usual, -0.1 * usual
+    left = np.array([[*lamp, brighter], [*label, brighter], [*shade, 0.0]])
+    assert _shines(left, usual, ChartConfig()).tolist() == [True, False, False]
+
+
+def test_places_have_the_height_above_the_table_that_pixels_around_them_have() -> None:
+    up, offset = np.array([0.0, -0.6, -0.8]), 0.7
+    v, u = np.mgrid[0:30, 0:40]
+    depth = (0.8 + 0.002 * u + 0.003 * v).astype(np.float32)
+    points = np.stack([(u + 300 - 320) / 386, (v + 200 - 240) / 386, np.ones_like(u)], -1) * depth[..., None]
+    nothing = np.zeros(depth.shape, dtype=bool)
+    color = np.zeros((*depth.shape, 3), np.float32)
+    heights = (points @ up + offset).astype(np.float32)
+    crop = Crop(0, (300, 200), nothing, depth, color, nothing, heights, 0.0)
+    store = ViewStore(Optics.of(CAMERA), [crop], ViewConfig())
+    places = np.random.default_rng(0).normal([0, 0, 0.9], 0.05, (2, 5, 3))
+    np.testing.assert_allclose(_heights(store, 0, places), places @ up + offset, atol=1e-4)
