@@ -48,9 +48,9 @@ def test_a_body_that_stands_still_is_compared_with_what_it_showed_before_and_aft
 
 
 def test_views_are_compared_over_wide_turns_only_where_near_ones_are_few() -> None:
-    chain = [0.0, 60.0, 100.0, 140.0, 180.0, 220.0, 260.0, 300.0]
-    assert loops_of(0, pairs_of(chain, [])) == {7}  # 60 degrees away, the other way round
-    near = [0.0, 60.0, 100.0, 140.0, 180.0, 10.0, 220.0, 260.0, 20.0, 240.0]
+    chain = [0.0, 55.0, 100.0, 140.0, 180.0, 220.0, 260.0, 305.0]
+    assert loops_of(0, pairs_of(chain, [])) == {7}  # 55 degrees away, the other way round
+    near = [0.0, 55.0, 100.0, 140.0, 180.0, 10.0, 220.0, 260.0, 20.0, 240.0]
     assert loops_of(0, pairs_of(near, [])) == {5, 8}
 
 
