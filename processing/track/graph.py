@@ -32,7 +32,7 @@ class GraphConfig:
     """Views from near directions, whatever their time, that a view is compared with."""
     co_visible_deg: float = 50.0
     least_loops: int = 2
-    wide_deg: float = 60.0
+    wide_deg: float = 70.0
     """A view with fewer loops takes some from directions so far apart: they err more, but a chain drifts."""
     spread_in_time: int = 3
     """Of frames nearer to each other in time than this, or between which the object stands still, only one is taken for
