@@ -18,7 +18,8 @@ from processing.track.beam import BeamConfig, Candidate, Scene, Schedule, merged
 from processing.track.features import relative_motions
 from processing.track.keyframes import references
 from processing.track.motion import all_turns
-from processing.track.views import Crop, Optics
+from processing.track.optics import Optics
+from processing.track.views import Crop
 from recordings.errors import BadInput
 from recordings.tracks import ObjectShape
 

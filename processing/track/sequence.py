@@ -21,8 +21,9 @@ from processing.track.flags import FlagConfig, doubt, flagged, per_view
 from processing.track.keyframes import is_new
 from processing.track.known_shape import ShapeConfig, ShapeViews, located, middle_of, shape_views
 from processing.track.motion import gravity_in_camera
+from processing.track.optics import Optics
 from processing.track.story import Story, StoryConfig, apart_deg, settled
-from processing.track.views import Crop, Optics, ViewConfig, ViewStore, cut
+from processing.track.views import Crop, ViewConfig, ViewStore, cut
 from recordings.errors import BadInput
 from recordings.geometry import CameraModel, Transform
 from recordings.progress import Progress, Silent

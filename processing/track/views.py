@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Float32, Int64
 from numpy import ndarray as Array
 
 from processing.track import kernels as k
-from recordings.geometry import CameraModel
+from processing.track.optics import Optics
 from recordings.records import RgbdFrame
 
 
@@ -32,8 +32,9 @@ class ViewConfig:
     smooth_px: float = 2.5
     """Blur of the smooth grey level, which widens the basin of attraction."""
     rim_px: float = 2.0
-    """Looks so near to the outline are mixed with the background's (optics, chroma of JPEG): they would stay with the
-    picture, not with the object. Those farther inside are blurred outwards over them."""
+    rim_share: float = 0.05
+    """Looks so near to the outline (pixels; at most this share of the object's size) are mixed with the background's by
+    optics and JPEG: they would stay with the picture. Those farther inside are blurred outwards over them."""
     shade_px: float = 5.0
     """Scale over which brightness is levelled: shading and exposure are no texture."""
     bright_gain: float = 0.5
@@ -52,38 +53,6 @@ class ViewConfig:
     """What is nearer than the object by this may cover it."""
     above_table_m: float = 0.02
     """What is lower above the table than this is the table, which covers nothing."""
-
-
-@dataclass(frozen=True, eq=False)
-class Optics:
-    """A camera as an ideal pinhole, with the maps that undo its distortion (None where it has none)."""
-
-    camera: CameraModel
-    map_u: Float32[Array, "h w"] | None
-    map_v: Float32[Array, "h w"] | None
-
-    @staticmethod
-    def of(camera: CameraModel) -> Optics:
-        if camera.distortion_model == "none":
-            return Optics(camera, None, None)
-        u, v = np.meshgrid(np.arange(camera.width, dtype=np.float64), np.arange(camera.height, dtype=np.float64))
-        rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], -1)
-        pixels = np.nan_to_num(camera.project(rays), nan=-1e4)
-        return Optics(camera, pixels[..., 0].astype(np.float32), pixels[..., 1].astype(np.float32))
-
-    @property
-    def focal(self) -> Float[Array, "2"]:
-        return np.array([self.camera.fx, self.camera.fy])
-
-    @property
-    def center(self) -> Float[Array, "2"]:
-        return np.array([self.camera.cx, self.camera.cy])
-
-    def straight(self, image: Array, smooth: bool) -> Array:
-        """The image as the pinhole would see it."""
-        if self.map_u is None or self.map_v is None:
-            return image
-        return cv2.remap(image, self.map_u, self.map_v, cv2.INTER_LINEAR if smooth else cv2.INTER_NEAREST)
 
 
 @dataclass(frozen=True, eq=False)
@@ -259,7 +228,8 @@ def _looks(crop: Crop, config: ViewConfig) -> Float32[Array, "h w 6"]:
     differences of colour, each sharp and smooth."""
     color, mask = crop.color, crop.mask
     foreign = None if crop.colorless is None else cv2.dilate(crop.colorless.astype(np.uint8), np.ones((3, 3))) > 0
-    own = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, 5) > config.rim_px
+    rim_px = min(config.rim_px, config.rim_share * float(np.sqrt(mask.sum())))
+    own = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, 5) > rim_px
     weight = (own if foreign is None else own & ~foreign).astype(np.float32)
     red, green, blue = color[..., 0], color[..., 1], color[..., 2]
     gray = 0.299 * red + 0.587 * green + 0.114 * blue

@@ -11,10 +11,11 @@ from processing.track.contradiction import ContradictionConfig, Opposed, Rims
 from processing.track.contradiction import _against as against
 from processing.track.keyframes import view_directions
 from processing.track.known_shape import ShapeConfig, shape_views
+from processing.track.optics import Optics
 from processing.track.pool import Pool, far_apart, sides
 from processing.track.propose import Fit, distinct
 from processing.track.register import RegisterConfig
-from processing.track.views import Optics, ViewConfig, ViewStore
+from processing.track.views import ViewConfig, ViewStore
 from recordings.geometry import CameraModel, rotation_exp
 from recordings.tracks import ObjectShape
 

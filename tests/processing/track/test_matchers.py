@@ -18,8 +18,9 @@ from processing.track.matchers_lightglue import LightGlue, LightGlueConfig, empt
 from processing.track.matchers_loftr import Grid, Loftr, LoftrConfig
 from processing.track.matchers_xfeat import XFeat, XFeatConfig
 from processing.track.notes import NotesConfig, notes_of
+from processing.track.optics import Optics
 from processing.track.sequence import TossTrack
-from processing.track.views import Optics, ViewConfig, ViewStore, cut
+from processing.track.views import ViewConfig, ViewStore, cut
 from recordings.errors import BadInput
 from recordings.geometry import CameraModel, rotation_exp
 from recordings.records import RgbdFrame

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from processing.track import kernels as k
+from processing.track.optics import Optics
 from processing.track.round_axis import Axis
 from processing.track.round_body import BodyConfig, RoundBody, anchored, is_round
-from processing.track.views import Crop, Optics, ViewConfig, ViewStore
+from processing.track.views import Crop, ViewConfig, ViewStore
 from recordings.geometry import CameraModel, rotation_exp
 
 CAMERA = CameraModel("d455", 640, 480, np.array([[386.0, 0, 320], [0, 386, 240], [0, 0, 1]]))

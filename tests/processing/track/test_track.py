@@ -17,9 +17,10 @@ from processing.track.flags import camera_covariance
 from processing.track.graph import GraphConfig, Motion, _add_motion, flight_center
 from processing.track.keyframes import KeyframeConfig, references
 from processing.track.motion import MotionConfig, all_turns, change_cost, moved, steady_spin, turn_between
+from processing.track.optics import Optics
 from processing.track.register import register_tosses
 from processing.track.sequence import TossTrack, track_toss
-from processing.track.views import Optics, ViewConfig, cut, make_view
+from processing.track.views import ViewConfig, cut, make_view
 from recordings.errors import BadInput
 from recordings.geometry import CameraModel, Transform, rotation_exp
 from recordings.records import RgbdFrame

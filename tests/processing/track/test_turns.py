@@ -10,10 +10,11 @@ from processing.track import turn_kernels as tk
 from processing.track.beam import Scene
 from processing.track.charts import ChartConfig, Charts, _heights, _shines
 from processing.track.features import Sift
+from processing.track.optics import Optics
 from processing.track.round_axis import Axis, AxisConfig, open_axis
 from processing.track.steady_turns import Pace, SteadyConfig, steadied
 from processing.track.turns import TurnConfig, Turned, _usual, doubted
-from processing.track.views import Crop, Optics, ViewConfig, ViewStore
+from processing.track.views import Crop, ViewConfig, ViewStore
 from recordings.geometry import CameraModel, rotation_exp
 
 CAMERA = CameraModel("d455", 640, 480, np.array([[386.0, 0, 320], [0, 386, 240], [0, 0, 1]]))
