@@ -27,6 +27,8 @@ from processing.contact.segment import pose_noise
 
 LEAST_LOAD_G, MOST_LOAD_G = 0.3, 2.5
 """What the plane carries in a frame, in weights of the body; the frames beside it may carry twice the most."""
+LONGEST_STEP_S = 0.01
+"""Between frames further apart a body may strike and leave: the mean load says nothing of the frame."""
 MOST_NOISE_G = 0.3
 """Poses whose noise makes the load less certain than this do not say what carries: 0.06 mm at 148 Hz."""
 TURNED_RAD = 0.02
@@ -89,8 +91,9 @@ def plane_by_touch(tracks: Sequence[PoseSeries], releases: Sequence[int], seed: 
 
 
 def _steady(track: PoseSeries) -> bool:
-    noise_g = 6**0.5 * pose_noise(track).position_m / track.step_s**2 / GRAVITY_M_S2
-    return len(track) >= 5 and noise_g < MOST_NOISE_G
+    if len(track) < 5 or track.step_s > LONGEST_STEP_S:
+        return False
+    return 6**0.5 * pose_noise(track).position_m / track.step_s**2 / GRAVITY_M_S2 < MOST_NOISE_G
 
 
 def touches(track: PoseSeries, release: int, name: int) -> Touches:
