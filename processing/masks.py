@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,7 +21,7 @@ from processing.segment.robot_frames import RobotFrames
 from processing.segment.robot_view import RobotView
 from processing.segment.segmenter import Example
 from processing.segment.sighting import courses_of, look_of, read_sighting, sightings, write_sightings
-from processing.segment.static_scene import StaticScene, calibrated_table_depth, learn_scene
+from processing.segment.static_scene import StaticScene, calibrated_table_depth, learn_scene, seen_table_depth
 from processing.stage import Counts, Done
 from recordings.errors import BadInput
 from recordings.records import RgbdFrame
@@ -37,7 +37,7 @@ def static_scene(run: Run) -> Done:
     them in the session that can be read and show the same."""
     inputs = {name: run.keys[name] for name in ("calibration", *(f"toss_{t:02d}" for t in run.recorded))}
     inputs |= keys_beside(run)
-    return run.store.run("scene", 5, run.config.scene, inputs, lambda folder: _learn_scene(run, folder))
+    return run.store.run("scene", 6, run.config.scene, inputs, lambda folder: _learn_scene(run, folder))
 
 
 def scene_notes(run: Run) -> tuple[str, ...]:
@@ -57,7 +57,11 @@ def _learn_scene(run: Run, folder: Path) -> Counts:
 
     hidden = hidden_by_robot(run, [(t, int(found.streams[t].times_ns[i])) for t, i in found.chosen])
     table = calibrated_table_depth(run.session.calibration, CAMERA)
-    scene = learn_scene(frames(), table, run.config.scene, hidden, [t for t, _ in found.chosen])
+    # a plane that only depth tells helps to learn what is beneath the object; nobody takes it for a calibrated table
+    seen = seen_table_depth([read(found, at).depth_m for at in found.chosen[:: max(1, len(found.chosen) // 9)]],
+                            run.camera) if table is None else table  # fmt: skip
+    scene = learn_scene(frames(), seen, run.config.scene, hidden, [t for t, _ in found.chosen])
+    scene = replace(scene, table_depth_m=np.zeros_like(scene.table_depth_m)) if table is None else scene
     scene.write(folder)
     return {
         "frames": len(found.chosen),

@@ -169,14 +169,14 @@ def _always_covered(
     out = np.zeros_like(stands)
     if not doubtful.any():
         return out
-    arrived = stands & (scene_m > 0) & ~above
+    arrived = cv2.morphologyEx((stands & (scene_m > 0) & ~above).astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3))) > 0
     _, labels = cv2.connectedComponents(stands.astype(np.uint8), connectivity=4)
     for k in np.unique(labels[doubtful]):
         thing = np.asarray(labels == k)
         came = thing & arrived
-        if came.sum() < settings.arrived_share * (thing & ~(above & (share >= settings.always_share))).sum():
+        if came.sum() < max(settings.arrived_share * thing.sum(), 1):
             continue
-        near, far = np.quantile(depth_m[came], (0.02, 0.98)) if came.any() else (0.0, 0.0)
+        near, far = np.quantile(depth_m[came], (0.02, 0.98))
         inside = (depth_m > near - settings.object_m) & (depth_m < far + settings.object_m)
         out |= thing & doubtful & inside
     solid = cv2.morphologyEx(out.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))  # no flickering edges
@@ -214,11 +214,9 @@ def _learn_rows(
     beneath = (on_table.sum(0) >= settings.table_looks) & (far < table_m + near_table_m)
     agrees = np.where(beneath, on_table, agrees)
     share = agrees.sum(0) / looks
-    valid = (
-        beneath
-        | (share >= settings.seen_share)
-        | ((share > 1 - settings.far_share) & (without < settings.no_return_share))
-    )
+    # what stands above the table for a while only may be the object at rest
+    seldom = (share > 1 - settings.far_share) & (without < settings.no_return_share) & (far > table_m - near_table_m)
+    valid = beneath | (share >= settings.seen_share) | seldom
     depth = _masked_median(z, agrees)
     sigma = 1.48 * _masked_median(np.abs(z - depth), agrees)
     empty = (agrees | (~seen & ~valid[None])) & ~hidden
@@ -296,6 +294,15 @@ def fit_plane(
     center = points_m[best].mean(0)
     normal = np.linalg.svd(points_m[best] - center, full_matrices=False)[2][2]
     return normal, float(normal @ center)
+
+
+def seen_table_depth(depths_m: Sequence[Float32[Array, "h w"]], camera: CameraModel) -> Float32[Array, "h w"] | None:
+    """Depth of the plane that most of what stood still lies on; None without a clear one."""
+    stack = np.stack([d[::8, ::8] for d in depths_m])
+    middle = _masked_median(stack, stack > 0)
+    points = camera.pixel_rays()[::8, ::8][middle > 0] * middle[middle > 0][:, None].astype(np.float64)
+    plane = fit_plane(points, 0.008)
+    return None if plane is None else plane_depth(camera, *plane)
 
 
 def with_object_removed(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,7 +11,7 @@ from numpy import ndarray as Array
 
 from processing.track.beam import Scene
 from processing.track.motion import between
-from recordings.geometry import rotation_log
+from recordings.geometry import rotation_log, skew
 from recordings.tracks import Status
 
 
@@ -30,6 +31,12 @@ class FlagConfig:
     sensor's fixed pattern). From the normalised errors on simulated variety."""
     rival_cost: float = 0.0015
     """Another story of the same frames that fits worse by this much counts half as evidence of doubt."""
+    joining_cost: float = 0.15
+    """Pairs of views that fit worse do not tell how one is turned against the other."""
+    joining_share: float = 0.5
+    """Nor do pairs that see less of each other's surface."""
+    unjoined_sigma_rad: float = 0.5
+    """How far views may be turned against the first one where no chain of pairs joins them to it."""
     unsure_deg: float = 15.0
     """A pose whose rotation may be off by more than this (standard deviation) is a guess, marked as interpolated: a
     flip (45 degrees) lies within three of them."""
@@ -56,6 +63,30 @@ def doubt(
         gap = np.concatenate([between_them[:3, 3], rotation_log(between_them[:3, :3])])
         out[i] = share * np.outer(gap, gap)
     return out
+
+
+def unjoined(
+    pairs: Int[Array, "m 2"], figures: Float[Array, "m 3"], roots: Sequence[int], use: Bool[Array, " n"],
+    config: FlagConfig,
+) -> Bool[Array, " n"]:  # fmt: skip
+    """Used frames that no chain of well fitting pairs joins to one of the roots (the first frame, a model's views):
+    each side of such a gap may fit in itself, and yet be turned against the other."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    fits = (figures[:, 0] < config.joining_cost) & (figures[:, 1] > config.joining_share)
+    count = max(len(use), int(pairs.max(initial=-1)) + 1, max(roots) + 1)
+    a, b = pairs[fits].T
+    _, label = connected_components(coo_array((np.ones(len(a)), (a, b)), shape=(count, count)), directed=False)
+    return np.asarray(use & ~np.isin(label[: len(use)], label[list(roots)]))
+
+
+def unjoined_doubt(
+    hanging: Bool[Array, " n"], center_m: Float[Array, "3"], config: FlagConfig
+) -> Float[Array, "n 6 6"]:
+    """Covariance (twist of the object frame, translation first) of a turn about the body's middle, for these frames."""
+    turn = np.vstack([skew(center_m), np.eye(3)])  # w about the point c moves the origin by -w x c = c x w
+    return np.where(hanging[:, None, None], config.unjoined_sigma_rad**2 * turn @ turn.T, 0.0)
 
 
 def flagged(

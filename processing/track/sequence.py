@@ -17,7 +17,7 @@ from processing.track.beam import BeamConfig, Candidate, Hypothesis, Scene, foll
 from processing.track.delay import unknown_motion
 from processing.track.exposure import Exposure
 from processing.track.features import FeatureMatcher, Sift
-from processing.track.flags import FlagConfig, doubt, flagged, per_view
+from processing.track.flags import FlagConfig, doubt, flagged, per_view, unjoined, unjoined_doubt
 from processing.track.keyframes import is_new
 from processing.track.known_shape import ShapeConfig, ShapeViews, located, middle_of, shape_views
 from processing.track.motion import gravity_in_camera
@@ -344,6 +344,8 @@ def _told(
         apart = other.total - best.total
         twists = twists + doubt(joint.poses[:n], other.joint.poses[:n], apart, config.flags)
     twists = twists + unknown_motion(scene, joint.poses[:n], best.use)
+    hanging = unjoined(joint.pairs, joint.figures, (first, *range(n, len(scene.store))), best.use & ~lost, config.flags)
+    twists = twists + unjoined_doubt(hanging, best.center_m, config.flags)
     poses, status, covariance = flagged(joint.poses[:n], twists, lost, scene, config.flags)
     times_ns = np.array([f.time_ns for f in frames], dtype=np.int64)
     track = ObjectTrack(toss, camera, object_frame, times_ns, poses, status, covariance)

@@ -16,7 +16,13 @@ from processing.pipeline import Run, start_run
 from processing.segment.background import BackgroundSegmenter
 from processing.segment.follow import BackgroundSettings
 from processing.segment.moving_camera import why_other_scene
-from processing.segment.static_scene import SceneSettings, StaticScene, calibrated_table_depth, learn_scene
+from processing.segment.static_scene import (
+    SceneSettings,
+    StaticScene,
+    calibrated_table_depth,
+    learn_scene,
+    seen_table_depth,
+)
 from recordings.errors import DamagedFile
 from recordings.geometry import rotation_exp
 from recordings.progress import Silent
@@ -46,14 +52,16 @@ def falls_back(tiny_world: Any) -> tuple[list[RgbdFrame], list[np.ndarray]]:
     return [f for f, _ in seen], [m for _, m in seen]
 
 
-@pytest.mark.parametrize("bare_frames", [0, 3])
+@pytest.mark.parametrize(("bare_frames", "calibrated"), [(0, True), (3, True), (0, False)])
 def test_an_object_at_rest_is_not_the_scene_whatever_was_seen_beneath(
-    tiny_world: Any, falls_back: tuple[list[RgbdFrame], list[np.ndarray]], bare_frames: int
+    tiny_world: Any, falls_back: tuple[list[RgbdFrame], list[np.ndarray]], bare_frames: int, calibrated: bool
 ) -> None:
     frames, masks = list(falls_back[0]), list(falls_back[1])
     for i in range(bare_frames):
         frames[HELD + i], masks[HELD + i] = tiny_world.see(None, HELD + i)
     table = calibrated_table_depth(tiny_world.calibration, "d455")
+    if not calibrated:
+        table = seen_table_depth([f.depth_m for f in frames[::4]], tiny_world.camera)
     scene = learn_scene(frames, table, SceneSettings())
     empty, _ = tiny_world.see(None)
     np.testing.assert_allclose(scene.depth_m[masks[-1]], empty.depth_m[masks[-1]], atol=0.004)
