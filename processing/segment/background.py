@@ -15,7 +15,7 @@ from numpy import ndarray as Array
 
 from processing.segment.candidates import Finder
 from processing.segment.follow import BackgroundSettings, Beside, Found, Memory, component_in, follow, remember
-from processing.segment.foreground import moved_pixels, refine_border
+from processing.segment.foreground import grown, moved_pixels, refine_border
 from processing.segment.robot_frames import RobotFrames, robot_likeness, with_robot
 from processing.segment.segmenter import Example, FrameMask
 from processing.segment.sighting import FindSettings, Sighting, courses_of, look_of, sightings
@@ -121,7 +121,7 @@ class BackgroundSegmenter:
         first, s = self._leveled(frames[start])[0], self._settings
         scene = self._scene_without(first, seed.mask)
         for order in (range(start + 1, len(frames)), range(start - 1, -1, -1)):
-            memory = remember(None, first, seed)
+            memory = replace(remember(None, first, seed), others_near=self._held(first, scene, seed.mask))
             if self._sighting is not None:
                 memory = replace(memory, likeness=memory.likeness.with_shares(self._sighting.shares))
             for i in order:
@@ -132,6 +132,12 @@ class BackgroundSegmenter:
                 found = Found(given[i], 1.0) if i in given else self._followed(frame, i, scene, memory, block, lit)
                 memory = remember(memory, frame, found, learn=lit and found.confidence > s.sure)
                 yield i, found, lit
+
+    def _held(self, frame: RgbdFrame, scene: StaticScene, mask: Bool[Array, "h w"]) -> bool:
+        """Whether something that is neither scene nor a known robot stands beside the object, as a hand does."""
+        s = self._settings
+        around = grown(mask, int(0.6 * np.sqrt(mask.sum())) + 4) & ~grown(mask, 3)
+        return self._drawn is None and int((moved_pixels(frame, scene, s.foreground) & around).sum()) > 3 * s.least_px
 
     def _seen_again(
         self,

@@ -35,7 +35,8 @@ class BackgroundSettings:
     grown: float = 1.4
     """A component larger than the expected mask by this factor holds something else as well."""
     turned: float = 0.6
-    """What has grown on the object is its own within this share of its size."""
+    turned_m: float = 0.15
+    """What has grown on the object is its own within this share of its size, and this much in depth."""
     depth_margin_m: float = 0.04
     """The object's depth in a frame exceeds the last frame's range by no more than this, when others touch it."""
     sure: float = 0.7
@@ -194,7 +195,8 @@ def _is_all_object(
 ) -> bool:
     """Whether what has grown on the object is its own, as of a box that turns its broad side.
 
-    It lies at the object's depth and does not reach far, and nothing else was near that could have touched it.
+    It does not reach far, in the image or in depth, and nothing else was near that could have touched it. Its colours
+    say nothing: a box that spins shows a side in this frame that it never showed before.
     """
     added = rough & ~expected
     reach = cv2.distanceTransform((~expected).astype(np.uint8), cv2.DIST_L2, 3)[added]
@@ -202,9 +204,8 @@ def _is_all_object(
         return False
     low, high = memory.depth_range_m
     depth = frame.depth_m[added & (frame.depth_m > 0)]
-    inside = (depth > low - s.depth_margin_m) & (depth < high + s.depth_margin_m)
-    alike = memory.likeness.log_odds(frame.color_rgb)[added]
-    return bool(len(depth) > 0 and inside.mean() > 0.9 and alike.mean() > -0.5)
+    inside = (depth > low - s.turned_m) & (depth < high + s.turned_m)
+    return bool(len(depth) > 0 and inside.mean() > 0.9)
 
 
 def _other_pieces(
