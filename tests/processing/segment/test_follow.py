@@ -13,29 +13,29 @@ from recordings.records import RgbdFrame
 
 H, W = 120, 160
 RED, BLUE, GREY = (200, 30, 30), (30, 30, 200), (120, 120, 120)
-BEFORE, TURNED = np.s_[40:70, 50:80], np.s_[40:70, 50:102]
+BEFORE, TURNED = np.s_[40:70, 50:80], np.s_[40:70, 50:96]
 
 
-def frame(sides: dict[tuple[slice, slice], tuple[tuple[int, int, int], float]]) -> RgbdFrame:
+def frame(*sides: tuple[tuple[slice, slice], tuple[int, int, int], float]) -> RgbdFrame:
     color, depth = np.full((H, W, 3), GREY, dtype=np.uint8), np.ones((H, W), dtype=np.float32)
-    for at, (paint, depth_m) in sides.items():
+    for at, paint, depth_m in sides:
         color[at], depth[at] = paint, depth_m
     return RgbdFrame("d455", 0, 0, 0, color, depth)
 
 
 @pytest.mark.parametrize("other_near", [False, True])
 def test_a_side_never_seen_before_is_the_bodys_own_unless_something_else_was_near(other_near: bool) -> None:
-    empty = frame({})
+    empty = frame()
     scene = StaticScene(
         empty.depth_m, np.full((H, W), 0.001, np.float32), empty.color_rgb.astype(np.float32),
         np.ones((H, W), np.float32), np.ones((H, W), dtype=bool), empty.depth_m,
     )  # fmt: skip
     first = np.zeros((H, W), dtype=bool)
     first[BEFORE] = True
-    memory = remember(None, frame({BEFORE: (RED, 0.7)}), Found(first, 1.0))
-    turned = frame({TURNED: (BLUE, 0.62), BEFORE: (RED, 0.66)})
+    memory = remember(None, frame((BEFORE, RED, 0.7)), Found(first, 1.0))
+    turned = frame((TURNED, BLUE, 0.62), (BEFORE, RED, 0.66))
     found = follow(turned, scene, replace(memory, others_near=other_near), None, None, BackgroundSettings())
     body = np.zeros((H, W), dtype=bool)
     body[TURNED] = True
     overlap = (found.mask & body).sum() / (found.mask | body).sum()
-    assert overlap < 0.7 if other_near else overlap > 0.95
+    assert overlap < 0.75 if other_near else overlap > 0.95
