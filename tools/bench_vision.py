@@ -108,17 +108,18 @@ def own_masks(session: Session, numbers: Sequence[int]) -> dict[int, tuple[Masks
     settings, camera = SceneSettings(), session.calibration.camera(CAMERA)
     places = sample_positions([len(s) for s in streams.values()], settings.frames)
     table = calibrated_table_depth(session.calibration, CAMERA)
-    scene = learn_scene((list(streams.values())[t][p] for t, p in places), table, settings)
+    frames = (list(streams.values())[t][p] for t, p in places)
+    scene = learn_scene(frames, table, settings, tosses=[t for t, _ in places])
     out = {}
-    start, frames = time.process_time(), 0
+    start, count = time.process_time(), 0
     for n, stream in streams.items():
         first = dict(sorted(session.toss(n).masks().items())[:1])
         example = None if first else _example(session, numbers)
         found = BackgroundSegmenter(scene, camera, BackgroundSettings()).masks(stream, first, example, None, Silent())
         ordered = sorted(found, key=lambda m: m.position)
         out[n] = ([m.mask for m in ordered], np.array([m.confidence for m in ordered]))
-        frames += len(stream)
-    print(f"{session.name}: own masks, {1000 * (time.process_time() - start) / frames:.0f} CPU-ms a frame")
+        count += len(stream)
+    print(f"{session.name}: own masks, {1000 * (time.process_time() - start) / count:.0f} CPU-ms a frame")
     return out
 
 
