@@ -20,6 +20,7 @@ from processing.segment.foreground import (
     smooth,
     window_around,
 )
+from processing.segment.late_depth import LateDepthSettings, at_color_time, way_px
 from processing.segment.likeness import Likeness
 from processing.segment.static_scene import StaticScene
 from recordings.records import RgbdFrame
@@ -30,6 +31,7 @@ class BackgroundSettings:
     """How masks are followed from frame to frame."""
 
     foreground: ForegroundSettings = field(default_factory=ForegroundSettings)
+    late: LateDepthSettings = field(default_factory=LateDepthSettings)
     least_px: int = 120
     """A smaller thing is not the object."""
     grown: float = 1.4
@@ -72,6 +74,9 @@ class Memory:
     missed: int = 0
     others_near: bool = False
     """Something else that is not scene was near the object in the last frame: a hand, a stick."""
+    time_ns: int = 0
+    speed_px_s: Float[Array, "2"] = field(default_factory=lambda: np.zeros(2))
+    """Colour's time when the object was last found, and how fast it then moved in the image."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,10 +107,19 @@ def remember(memory: Memory | None, frame: RgbdFrame, found: Found, learn: bool 
     depth = frame.depth_m[mask & (frame.depth_m > 0)]
     low, high = (float(d) for d in np.quantile(depth, (0.02, 0.98))) if len(depth) > 10 else (0.0, 20.0)
     if memory is None:
-        return Memory(mask, np.zeros(2), (low, high), Likeness.of(frame.color_rgb, mask))
-    velocity = (_center(mask) - _center(memory.mask)) / (memory.missed + 1)
+        return Memory(mask, np.zeros(2), (low, high), Likeness.of(frame.color_rgb, mask), time_ns=frame.time_ns)
+    way = _center(mask) - _center(memory.mask)
     likeness = memory.likeness.learned(frame.color_rgb, mask) if learn else memory.likeness
-    return Memory(mask, velocity, (low, high), likeness, others_near=found.others_near)
+    speed = way / ((frame.time_ns - memory.time_ns) * 1e-9) if frame.time_ns != memory.time_ns else np.zeros(2)
+    return Memory(
+        mask,
+        way / (memory.missed + 1),
+        (low, high),
+        likeness,
+        others_near=found.others_near,
+        time_ns=frame.time_ns,
+        speed_px_s=speed,
+    )
 
 
 def _center(mask: Bool[Array, "h w"]) -> Float[Array, "2"]:
@@ -128,6 +142,10 @@ def follow(
     area = int(memory.mask.sum())
     reach = int(0.6 * np.sqrt(area)) * (memory.missed + 1) + 4
     near = grown(expected, min(reach, 150))
+    way = way_px(frame, memory.speed_px_s)
+    if np.linalg.norm(way) > s.late.least_px:
+        body = component_in(_moved_by_depth(frame, scene, block, s), _shifted(near, -way))
+        frame = at_color_time(frame, scene, body, way, s.late)
     moved = moved_pixels(frame, scene, s.foreground)
     if (moved & ~scene.known).any():
         alike = memory.likeness.log_odds(frame.color_rgb) > 0
@@ -165,6 +183,14 @@ def follow(
     others_near = int((solid & ~grown(mask, 3)).sum()) > s.least_px or int((solid & ~mask).sum()) > 3 * s.least_px
     largest = _largest_other(moved & ~grown(mask, 9), s)
     return Found(mask, float(np.clip(sure * min(1.0, ratio / 0.7), 0, 1)), others_px, others_near, largest)
+
+
+def _moved_by_depth(
+    frame: RgbdFrame, scene: StaticScene, block: Bool[Array, "h w"] | None, s: BackgroundSettings
+) -> Bool[Array, "h w"]:
+    nearer = nearer_than_scene(frame.depth_m, scene, s.foreground)
+    nearer = nearer if block is None else nearer & ~block
+    return cv2.morphologyEx(nearer.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)) > 0
 
 
 def _largest_other(moved: Bool[Array, "h w"], s: BackgroundSettings) -> int:

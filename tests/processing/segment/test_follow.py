@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from processing.segment.follow import BackgroundSettings, Found, follow, remember
+from processing.segment.late_depth import LateDepthSettings, at_color_time, way_px
 from processing.segment.static_scene import StaticScene
 from recordings.records import RgbdFrame
 
@@ -23,13 +24,17 @@ def frame(*sides: tuple[tuple[slice, slice], tuple[int, int, int], float]) -> Rg
     return RgbdFrame("d455", 0, 0, 0, color, depth)
 
 
-@pytest.mark.parametrize("other_near", [False, True])
-def test_a_side_never_seen_before_is_the_bodys_own_unless_something_else_was_near(other_near: bool) -> None:
+def empty_scene() -> StaticScene:
     empty = frame()
-    scene = StaticScene(
+    return StaticScene(
         empty.depth_m, np.full((H, W), 0.001, np.float32), empty.color_rgb.astype(np.float32),
         np.ones((H, W), np.float32), np.ones((H, W), dtype=bool), empty.depth_m,
     )  # fmt: skip
+
+
+@pytest.mark.parametrize("other_near", [False, True])
+def test_a_side_never_seen_before_is_the_bodys_own_unless_something_else_was_near(other_near: bool) -> None:
+    scene = empty_scene()
     first = np.zeros((H, W), dtype=bool)
     first[BEFORE] = True
     memory = remember(None, frame((BEFORE, RED, 0.7)), Found(first, 1.0))
@@ -39,3 +44,13 @@ def test_a_side_never_seen_before_is_the_bodys_own_unless_something_else_was_nea
     body[TURNED] = True
     overlap = (found.mask & body).sum() / (found.mask | body).sum()
     assert overlap < 0.75 if other_near else overlap > 0.95
+
+
+def test_late_depth_is_put_where_colour_shows_the_body() -> None:
+    color, depth = frame((np.s_[40:70, 50:80], RED, 0.7)), frame((np.s_[44:74, 57:87], RED, 0.7))
+    late = replace(color, depth_m=depth.depth_m, depth_time_ns=16_000_000)
+    body = depth.depth_m < 0.9
+    foretold = way_px(late, np.array([375.0, 312.5]))  # px/s: 6 and 5 px in 16 ms, where 7 and 4 is right
+    np.testing.assert_allclose(foretold, [-6, -5])
+    found = at_color_time(late, empty_scene(), body, foretold, LateDepthSettings())
+    np.testing.assert_array_equal(found.depth_m, color.depth_m)
