@@ -11,8 +11,7 @@ import sys
 from collections.abc import Sequence
 
 import numpy as np
-import torch
-from bench_contact import CUBE, block, l_mesh, line, noisy, prism, simulated, there, toss
+from bench_contact import CUBE, block, l_mesh, line, noisy, prism, run_cases, simulated, there, toss
 
 from processing.contact import data_checks as checks
 from processing.contact.geometry import CORNERS
@@ -123,16 +122,5 @@ def forecast() -> None:
 CASES = {"touch": touched, "forecast": forecast}
 
 
-def main() -> int:
-    torch.set_num_threads(1)
-    wrong = [c for c in sys.argv[1:] if c not in CASES]
-    if wrong:
-        print(f"no case {wrong}; there are {list(CASES)}", file=sys.stderr)
-        return 2
-    for case in sys.argv[1:] or CASES:
-        CASES[case]()
-    return 0
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run_cases(CASES))

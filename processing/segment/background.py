@@ -14,7 +14,16 @@ from jaxtyping import Bool, Float
 from numpy import ndarray as Array
 
 from processing.segment.candidates import Finder
-from processing.segment.follow import BackgroundSettings, Beside, Found, Memory, component_in, follow, remember
+from processing.segment.follow import (
+    BackgroundSettings,
+    Beside,
+    Found,
+    Memory,
+    component_in,
+    follow,
+    reach_px,
+    remember,
+)
 from processing.segment.foreground import grown, moved_pixels, refine_border
 from processing.segment.robot_frames import RobotFrames, robot_likeness, with_robot
 from processing.segment.segmenter import Example, FrameMask
@@ -136,7 +145,7 @@ class BackgroundSegmenter:
     def _held(self, frame: RgbdFrame, scene: StaticScene, mask: Bool[Array, "h w"]) -> bool:
         """Whether something that is neither scene nor a known robot stands beside the object, as a hand does."""
         s = self._settings
-        around = grown(mask, int(0.6 * np.sqrt(mask.sum())) + 4) & ~grown(mask, 3)
+        around = grown(mask, reach_px(int(mask.sum()), 1)) & ~grown(mask, 3)
         return self._drawn is None and int((moved_pixels(frame, scene, s.foreground) & around).sum()) > 3 * s.least_px
 
     def _seen_again(

@@ -128,6 +128,11 @@ def _center(mask: Bool[Array, "h w"]) -> Float[Array, "2"]:
     return np.array([moments["m10"], moments["m01"]]) / max(moments["m00"], 1.0)
 
 
+def reach_px(area_px: int, steps: int) -> int:
+    """How far around the expected mask the object is sought, or something that may touch it, after so many frames."""
+    return int(0.6 * np.sqrt(area_px)) * steps + 4
+
+
 def follow(
     frame: RgbdFrame,
     scene: StaticScene,
@@ -140,7 +145,7 @@ def follow(
     shift = memory.velocity_px * (memory.missed + 1)
     expected = _shifted(memory.mask, shift)
     area = int(memory.mask.sum())
-    reach = int(0.6 * np.sqrt(area)) * (memory.missed + 1) + 4
+    reach = reach_px(area, memory.missed + 1)
     near = grown(expected, min(reach, 150))
     way = way_px(frame, memory.speed_px_s)
     if np.linalg.norm(way) > s.late.least_px:
