@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Float32, Int
 from numpy import ndarray as Array
 
 from processing.track import kernels as k
@@ -44,7 +44,7 @@ class ChartConfig:
     grey: float = 1.2
     """... unless it is paler than this share of the way to grey."""
     table_m: float = 0.006
-    """A place that lies deeper in the table is empty."""
+    """A place that lies deeper in the table is empty, and what is no higher above it may be the table."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,19 +52,21 @@ class Charts:
     """`looks` (v, r, c, 2): two differences of colour without the light, mean per cell; `count` (v, r, c): pixels.
     `odd` (v, q, c): share of cells where something stands off the body, `sides` (v, 3, q, c) the same by the side that
     was seen; `free` (v, q, c): 1 where nothing stands. Rows r: outside by height, both ends by radius; q: layers times
-    heights; c: angles about the axis."""
+    heights; c: angles about the axis. `standing`: per view the pixels of what stands off the body, as samples."""
 
     looks: Float[Array, "v r c 2"]
     count: Float[Array, "v r c"]
     odd: Float[Array, "v q c"]
     sides: Float[Array, "v 3 q c"]
     free: Float[Array, "v q c"]
+    standing: list[Float32[Array, "p s"]]
 
 
 @dataclass(frozen=True, eq=False)
 class _Pixels:
     """Surface pixels of one view: along the axis (m), distance from it, angle about it, its normal's parts along the
-    axis, away from it and around it; cosine to the camera; normal (camera axes), colours, brightness."""
+    axis, away from it and around it; cosine to the camera; normal (camera axes), colours, brightness; height above the
+    table (infinite where that is not known); all of it as samples in camera axes."""
 
     along_m: Float[Array, " p"]
     radius_m: Float[Array, " p"]
@@ -74,6 +76,8 @@ class _Pixels:
     normal_camera: Float[Array, "p 3"]
     looks: Float[Array, "p 2"]
     bright: Float[Array, " p"]
+    height_m: Float[Array, " p"]
+    samples: Float32[Array, "p s"]
 
 
 def charts_of(
@@ -90,6 +94,7 @@ def charts_of(
     mean, count = np.zeros((len(views), rows, cells, 2)), np.zeros((len(views), rows, cells))
     odd = np.zeros((len(views), 3, layers * heights, cells))
     free = np.zeros((len(views), layers * heights, cells))
+    standing = []
     for n, (i, p) in enumerate(zip(views, seen)):
         cell = np.floor((p.angle + np.pi) / (2 * np.pi) * cells).astype(int) % cells
         row = _rows(p, profile, low, high, ends, config)
@@ -100,9 +105,10 @@ def charts_of(
         height, layer, side, off = _off(p, profile, low, config)
         np.add.at(odd[n], (side[off], layer[off] * heights + height[off], cell[off]), 1)
         free[n] = _free(scene, int(i), poses[i], axis, profile, low, cells, config)
+        standing.append(p.samples[off])
     mean /= np.maximum(count, 1)[..., None]
     anyhow = np.minimum(odd.sum(1), 3) / 3
-    return Charts(mean, count, anyhow, np.minimum(odd, 3) / 3, free * (anyhow == 0))
+    return Charts(mean, count, anyhow, np.minimum(odd, 3) / 3, free * (anyhow == 0), standing)
 
 
 def across(axis: Axis) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
@@ -131,7 +137,9 @@ def _pixels(scene: Scene, view: int, pose: Float[Array, "4 4"], axis: Axis) -> _
     assert crop is not None  # a view with pixels has a crop
     bright = np.log(crop.color[v, u].astype(np.float64) @ [0.299, 0.587, 0.114] + 0.02)
     looks = here[:, k.SHARP + 1 : k.SHARP + 3]
-    return _Pixels(own @ axis.direction, radius, np.arctan2(y, x), parts, facing, normal, looks, bright)
+    above = np.full(len(u), np.inf) if crop.height_m is None else crop.height_m[v, u].astype(np.float64)
+    samples = np.concatenate([p, here[:, k.NX : k.NZ + 1], here[:, k.SHARP :]], axis=1).astype(np.float32)
+    return _Pixels(own @ axis.direction, radius, np.arctan2(y, x), parts, facing, normal, looks, bright, above, samples)
 
 
 def _light(normal: Float[Array, "p 3"], bright: Float[Array, " p"]) -> Float[Array, "p t"]:
@@ -223,6 +231,7 @@ def _off(
     step = config.layers_m[1] - config.layers_m[0]
     layer = np.clip(np.round((above - config.layers_m[0]) / step).astype(int), 0, len(config.layers_m) - 1)
     off = known & (above > config.odd_m) & (above < config.layers_m[-1] + 2 * step) & (p.facing > 0.15)
+    off &= p.height_m > config.table_m
     side = np.where(p.normal[:, 2] > 0.35, 0, np.where(p.normal[:, 2] < -0.35, 2, 1))
     return height, layer, side, off
 

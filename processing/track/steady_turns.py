@@ -16,6 +16,7 @@ STARTING = 0.6
 """A start from rest changes the spin over its first step by half of what the same acceleration does later."""
 Terms = list[tuple[int, float, Float[Array, " v"]]]
 """View, change of spin there (rad/s), its derivative by all views' turns."""
+Normal = tuple[Float[Array, "v v"], Float[Array, " v"]]
 
 
 @dataclass(frozen=True)
@@ -43,12 +44,13 @@ class Pace:
 
 
 def steadied(
-    costs: Float[Array, "m d"], pairs: Int[Array, "m 2"], pace: Pace, cell_rad: float, first: int, config: SteadyConfig
-) -> tuple[Float[Array, " v"], Float[Array, " v"]]:
+    costs: Float[Array, "m d"], pairs: Int[Array, "m 2"], standing: Normal, pace: Pace, cell_rad: float, first: int,
+    config: SteadyConfig,
+) -> tuple[Float[Array, " v"], Float[Array, " v"]]:  # fmt: skip
     """Angles to add to each view's turn, and their standard deviations (rad); view `first` stays.
 
-    costs: of each pair by the difference of its views' angles, in cells around 0 (d odd). Gauss-Newton with each
-    curve's own slope and (if any) upward bend."""
+    costs: of each pair by the difference of its views' angles, in cells around 0 (d odd); `standing`: normal equations
+    of the same angles at 0 (`turns_of_standing`). Gauss-Newton with each curve's own slope and (if any) upward bend."""
     reach = costs.shape[1] // 2
     wide = np.pad(costs, ((0, 0), (2, 2)), mode="edge")
     smooth = sum(w * wide[:, s : s + costs.shape[1]] for s, w in enumerate((0.1, 0.2, 0.4, 0.2, 0.1)))
@@ -56,6 +58,7 @@ def steadied(
     H = np.eye(len(angle))
     for _ in range(config.steps):
         H, g = _of_pairs(np.asarray(smooth), pairs, angle / cell_rad, reach, cell_rad)
+        H, g = H + standing[0], g + standing[1] + standing[0] @ angle
         for view, change, slope in _changes(angle, pace):
             usual = config.flight_rad_s if pace.flies[view] else config.other_rad_s
             usual *= STARTING if pace.still[view] else 1.0

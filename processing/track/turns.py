@@ -14,15 +14,20 @@ from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Float32, Int
 from numpy import ndarray as Array
 
+from processing.track import kernels as k
 from processing.track import turn_kernels as tk
 from processing.track.beam import Scene
 from processing.track.charts import ChartConfig, Charts, charts_of
 from processing.track.round_axis import Axis, AxisConfig
-from processing.track.steady_turns import Pace, SteadyConfig, steadied
+from processing.track.steady_turns import Normal, Pace, SteadyConfig, steadied
+from processing.track.views import ViewStore
 from recordings.geometry import rotation_log
+
+NOT_COMPARED = 1e6
+"""Standard deviation of what does not count."""
 
 
 @dataclass(frozen=True)
@@ -54,6 +59,12 @@ class TurnConfig:
     match: float = 2.0
     clash: float = 2.0
     """Log ratio of a cell where something stands off the body in both views, or in one where the other saw nothing."""
+    standing_m: float = 0.003
+    """Depth of what stands off the body errs by this ..."""
+    standing_gain: float = 0.3
+    """... and neighbouring pixels together, so that a view counts for so much of their sum."""
+    least_standing: int = 5
+    """Pixels: fewer may be anything."""
     pair_dead: float = 2.0
     fine_dead: float = 0.5
     """A pair's looks below this are the light's."""
@@ -62,7 +73,9 @@ class TurnConfig:
     """A pair's word counts no more than this: highlights look like labels, but nothing looks like a handle."""
     left: float = 0.25
     """Mean of a pair's looks that even the best turns contradict; where more is left, looks stay with the room (a
-    lamp's mirror images, shadows) and count the less."""
+    lamp's mirror images, shadows) and count the less ..."""
+    left_share: float = 0.35
+    """... or where it is more than this share of what random turns leave: then looks are noise."""
     trusted: float = 0.7
     """Looks that count less than this make the search start again."""
     spin_change_rad_s: float = 1.5
@@ -120,7 +133,8 @@ def contradiction(
     frames = _frames(scene, use, config)
     if len(frames.pairs) == 0:
         return 0.0
-    costs, _ = _fine_costs(scene, poses, frames, found.axis, found.trust, config)
+    charts = charts_of(scene, poses, frames.views, found.axis, config.fine_cells, config.chart)
+    costs, _ = _fine_costs(charts, frames, found.trust, config)
     return float(costs[:, config.fine_reach].mean())
 
 
@@ -146,10 +160,9 @@ def turned(
     starts += [np.round(_angles(poses[frames.views], r[frames.views], axis) / step).astype(np.int64) % config.cells
                for r in rivals]  # fmt: skip
     state, trust = _sought(_near(looks, shape), rest, starts, config), 1.0
-    between = (state[frames.pairs[:, 0]] - state[frames.pairs[:, 1]]) % config.cells
-    left = float(_near(looks, np.zeros_like(looks))[np.arange(len(looks)), between].mean())
-    if 1 / (1 + (left / config.left) ** 2) < config.trusted:
-        trust = 1 / (1 + (left / config.left) ** 2)
+    believed = _believed(looks, frames.pairs, state, config)
+    if believed < config.trusted:
+        trust = believed
         state = _sought(_near(trust * looks, shape), rest, [*starts, state], config)
     sigma = np.sqrt(tk.spreads(state, _near(trust * looks, shape), *rest))
     out = _moved(poses, frames, state * step, axis, first)
@@ -157,6 +170,16 @@ def turned(
     for run, s in zip(frames.runs, sigma):
         spread[run] = s
     return steady(scene, Turned(out, spread, axis, trust), use, first, config)
+
+
+def _believed(
+    looks: Float[Array, "m c"], pairs: Int[Array, "m 2"], state: Int[Array, " v"], config: TurnConfig
+) -> float:
+    """How much looks count: fully where the found turns contradict few of them, and far fewer than random turns do."""
+    costs = _near(looks, np.zeros_like(looks))
+    left = costs[np.arange(len(costs)), (state[pairs[:, 0]] - state[pairs[:, 1]]) % config.cells].mean()
+    usual = min(config.left, max(config.left_share * costs.mean(), 1e-6))
+    return float(1 / (1 + (left / usual) ** 2))
 
 
 def _near(looks: Float[Array, "m c"], shape: Float[Array, "m c"]) -> Float[Array, "m c"]:
@@ -182,10 +205,12 @@ def steady(scene: Scene, found: Turned, use: Bool[Array, " n"], first: int, conf
     if len(frames.pairs) == 0:
         return found
     for _ in range(config.rounds):
-        costs, cell_rad = _fine_costs(scene, poses, frames, found.axis, found.trust, config)
+        charts = charts_of(scene, poses, frames.views, found.axis, config.fine_cells, config.chart)
+        costs, cell_rad = _fine_costs(charts, frames, found.trust, config)
+        standing = turns_of_standing(scene.store, poses[frames.views], frames, charts.standing, found.axis, config)
         pace = _pace(scene, poses, frames, found.axis, config)
         start = _run_of(frames.runs, first)
-        angle, sigma = steadied(costs, frames.pairs, pace, cell_rad, start, config.steady)
+        angle, sigma = steadied(costs, frames.pairs, standing, pace, cell_rad, start, config.steady)
         poses = _moved(poses, frames, angle, found.axis, first)
         for run, s in zip(frames.runs, sigma):
             spread[run] = s
@@ -204,11 +229,34 @@ def _moved(
     return out
 
 
-def _fine_costs(
-    scene: Scene, poses: Float[Array, "n 4 4"], frames: _Frames, axis: Axis, trust: float, config: TurnConfig
-) -> tuple[Float[Array, "m d"], float]:
+def turns_of_standing(
+    store: ViewStore, poses: Float[Array, "v 4 4"], frames: _Frames, standing: list[Float32[Array, "p s"]], axis: Axis,
+    config: TurnConfig,
+) -> Normal:  # fmt: skip
+    """How the turns of the frames' views (at `poses`) should change so that what stands off the body in one lies on its
+    surface in the others: normal equations (v, v), (v) in rad. A thin part's outline is too blurred to count."""
+    H, g = np.zeros((len(poses), len(poses))), np.zeros(len(poses))
+    share = config.standing_gain * len(poses) / (2 * len(frames.pairs))
+    for one, two in frames.pairs:
+        for i, j in ((one, two), (two, one)):
+            if len(standing[i]) < config.least_standing:
+                continue
+            h6, g6, full, slope = np.zeros((6, 6)), np.zeros(6), np.zeros((6, 6)), np.zeros(6)
+            k.pair_terms(
+                standing[i], 1, poses[j] @ k.inverse(poses[i]), store.maps, store.table[frames.views[j]],
+                store.optics.focal, store.optics.center, 0, config.standing_m, NOT_COMPARED, NOT_COMPARED, False,
+                h6, g6,
+            )  # fmt: skip
+            k.to_object(h6, g6, poses[j], 1.0, full, slope)
+            stiff, pull = share * float(axis.twist @ full @ axis.twist), -share * float(axis.twist @ slope)
+            H[[i, j], [i, j]] += stiff
+            H[[i, j], [j, i]] -= stiff
+            g[[i, j]] += pull, -pull
+    return H, g
+
+
+def _fine_costs(charts: Charts, frames: _Frames, trust: float, config: TurnConfig) -> tuple[Float[Array, "m d"], float]:
     """What each pair says against turns near those of the poses, in fine cells, and a cell's angle."""
-    charts = charts_of(scene, poses, frames.views, axis, config.fine_cells, config.chart)
     here = np.zeros(len(frames.views), dtype=np.int64)
     share = config.cells / config.fine_cells  # more cells, as many witnesses
     looks, shape = _said(charts, frames.pairs, config.fine_reach, here, config)

@@ -8,12 +8,12 @@ import pytest
 from processing.track import kernels as k
 from processing.track import turn_kernels as tk
 from processing.track.beam import Scene
-from processing.track.charts import ChartConfig, Charts, _heights, _shines
+from processing.track.charts import ChartConfig, Charts, _heights, _off, _Pixels, _shines
 from processing.track.features import Sift
 from processing.track.optics import Optics
 from processing.track.round_axis import Axis, AxisConfig, open_axis
 from processing.track.steady_turns import Pace, SteadyConfig, steadied
-from processing.track.turns import TurnConfig, Turned, _usual, doubted
+from processing.track.turns import TurnConfig, Turned, _believed, _Frames, _usual, doubted, turns_of_standing
 from processing.track.views import Crop, ViewConfig, ViewStore
 from recordings.geometry import CameraModel, rotation_exp
 
@@ -124,7 +124,8 @@ def test_a_stretch_that_shows_nothing_turns_as_steadily_as_what_is_seen_around_i
     moved = Pace(-np.diff(start), p.steps_s, p.still, p.flies, p.price)
     shift = start[pairs[:, 0]] - start[pairs[:, 1]]
     assert (shift == 0).all()
-    angle, sigma = steadied(costs, pairs, moved, cell, 0, SteadyConfig())
+    nothing = np.zeros((views, views)), np.zeros(views)
+    angle, sigma = steadied(costs, pairs, nothing, moved, cell, 0, SteadyConfig())
     np.testing.assert_allclose(start + angle, truth, atol=np.radians(1.5))
     assert sigma[0] == 0
     assert sigma[15] > 2 * sigma[5]
@@ -139,7 +140,7 @@ def test_looks_of_one_colour_say_nothing_and_a_label_says_where_it_is() -> None:
     sigma = np.full(2, 0.05)
 
     def said() -> np.ndarray:
-        charts = Charts(looks, count, np.zeros((2, 1, 60)), np.zeros((2, 3, 1, 60)), np.zeros((2, 1, 60)))
+        charts = Charts(looks, count, np.zeros((2, 1, 60)), np.zeros((2, 3, 1, 60)), np.zeros((2, 1, 60)), [])
         out[:] = 0
         tk.said_by_looks(looks, count, _usual(charts, sigma), pairs, sigma, 0.1, 0.5, 30, out)
         return out[0]
@@ -179,3 +180,59 @@ def test_places_have_the_height_above_the_table_that_pixels_around_them_have() -
     store = ViewStore(Optics.of(CAMERA), [crop], ViewConfig())
     places = np.random.default_rng(0).normal([0, 0, 0.9], 0.05, (2, 5, 3))
     np.testing.assert_allclose(_heights(store, 0, places), places @ up + offset, atol=1e-4)
+
+
+def test_the_table_seen_through_a_handle_stands_not_off_the_body() -> None:
+    heights_m = np.array([0.001, 0.004, 0.012, 0.04, np.inf])
+    n = len(heights_m)
+    aside = np.tile([0.0, 1.0, 0.0], (n, 1))
+    p = _Pixels(np.full(n, 0.02), np.full(n, 0.055), np.zeros(n), aside, np.ones(n), aside, np.zeros((n, 2)),
+                np.zeros(n), heights_m, np.zeros((n, k.SAMPLE), np.float32))  # fmt: skip
+    *_, off = _off(p, np.full(20, 0.04), 0.0, ChartConfig())
+    assert off.tolist() == [False, False, True, True, True]
+
+
+def test_looks_that_fit_no_turns_better_than_random_ones_are_not_believed() -> None:
+    rng = np.random.default_rng(0)
+    views, config = 12, TurnConfig()
+    cells = config.cells
+    pairs = np.array([(a, b) for a in range(views) for b in range(a)])
+    noise = rng.uniform(0.1, 0.2, (len(pairs), cells))
+    state = rng.integers(0, cells, views)
+    noise -= noise.min(1, keepdims=True)
+    assert _believed(noise, pairs, state, config) < 0.6
+    label = np.full((len(pairs), cells), 2.0)
+    at = (state[pairs[:, 0]] - state[pairs[:, 1]])[:, None] + np.arange(-2, 3)
+    np.put_along_axis(label, at % cells, 0.0, axis=1)
+    assert _believed(label + noise, pairs, state, config) > config.trusted
+    assert _believed(np.zeros_like(label), pairs, state, config) == 1.0
+
+
+def test_what_stands_off_the_body_tells_a_turn() -> None:
+    """Two views of a handle's side, a plate beside the axis; the second's pose is turned by what must be found."""
+    axis, wrong = Axis(np.array([0.0, 1.0, 0.0]), np.zeros(3)), np.radians(3.0)
+    turns, crops = (0.1, 0.4), []
+    poses = np.tile(np.eye(4), (2, 1, 1))
+    poses[:, 2, 3] = 0.7
+    for n, turn in enumerate(turns):
+        pose = poses[n] @ axis.turn(turn)
+        v, u = np.mgrid[180:300, 280:400]
+        rays = np.stack([(u - 320) / 386, (v - 240) / 386, np.ones(u.shape)], -1)
+        depth = (pose[:3, 2] @ pose[:3, 3]) / (rays @ pose[:3, 2])
+        x, y, _ = np.moveaxis((rays * depth[..., None] - pose[:3, 3]) @ pose[:3, :3], -1, 0)
+        mask = (x > 0.03) & (x < 0.07) & (np.abs(y) < 0.03)
+        nothing, depth = np.zeros(mask.shape, bool), np.where(mask, depth, 0).astype(np.float32)
+        crops.append(Crop(n, (280, 180), mask, depth, np.zeros((*mask.shape, 3), np.float32), nothing, None, 0.0))
+        poses[n] = poses[n] @ axis.turn(turn + n * wrong)
+    store = ViewStore(Optics.of(CAMERA), crops, ViewConfig())
+    assert all(store.fill(n) for n in range(2))
+    frames = _Frames([[0], [1]], np.arange(2), np.array([(1, 0)]))
+    standing = [store.samples[r[k.FIRST] : r[k.FIRST] + r[k.COUNT]] for r in store.table]
+    config = TurnConfig()
+    H, g = turns_of_standing(store, poses, frames, standing, axis, config)
+    assert -g[1] / H[1, 1] == pytest.approx(-wrong, rel=0.15)
+    np.testing.assert_allclose(H @ [1, 1], 0, atol=1e-9 * H[1, 1])
+    assert g[0] == pytest.approx(-g[1])
+    few = turns_of_standing(store, poses, frames, [s[: config.least_standing - 1] for s in standing], axis, config)
+    assert not few[0].any()
+    assert not few[1].any()
