@@ -59,9 +59,9 @@ class TurnConfig:
     match: float = 2.0
     clash: float = 2.0
     """Log ratio of a cell where something stands off the body in both views, or in one where the other saw nothing."""
-    standing_m: float = 0.003
+    standing_m: float = 0.002
     """Depth of what stands off the body errs by this ..."""
-    standing_gain: float = 0.3
+    standing_gain: float = 1.0
     """... and neighbouring pixels together, so that a view counts for so much of their sum."""
     least_standing: int = 5
     """Pixels: fewer may be anything."""
