@@ -9,6 +9,10 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray as Array
 
+from processing.track.beam import Scene
+from processing.track.delay import put_at_color_times
+from processing.track.features import Sift
+from processing.track.motion import gravity_in_camera
 from processing.track.sequence import TossTrack, TrackConfig, views_of
 from recordings.errors import BadInput
 from recordings.geometry import CameraModel, Transform
@@ -42,12 +46,13 @@ def read_toss_track(
     config: TrackConfig,
     world_from_camera: Transform | None,
 ) -> TossTrack:
-    """A toss's track as `track_toss` gave it, its views cut anew from the frames. The rejected candidates are gone."""
+    """A toss's track as `track_toss` gave it, its views cut anew from the frames and depth put where the track's motion
+    has it at colour's exposure. The rejected candidates are gone."""
     track = read_track(folder, toss)
-    store, _, _ = views_of(frames, masks, camera, confidence, config, world_from_camera, Silent())
+    store, times_s, _ = views_of(frames, masks, camera, confidence, config, world_from_camera, Silent())
     try:
         with np.load(folder / f"toss_{toss:02d}.fit.npz", allow_pickle=False) as stored:
-            return TossTrack(
+            tracked = TossTrack(
                 track=track,
                 cost=stored["cost"],
                 on_surface=stored["on_surface"],
@@ -62,3 +67,7 @@ def read_toss_track(
         raise BadInput(
             f"{folder} lacks how toss {toss} was tracked ({wrong}); remove that folder and run again"
         ) from wrong
+    gravity = gravity_in_camera(None if world_from_camera is None else world_from_camera.matrix)
+    scene = Scene(store, times_s, gravity, tracked.center_m, Sift())
+    put_at_color_times(scene, track.camera_from_object, ~track.lost)
+    return tracked

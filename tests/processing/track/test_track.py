@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,10 +18,11 @@ from processing.track.flags import camera_covariance
 from processing.track.graph import GraphConfig, Motion, _add_motion, flight_center
 from processing.track.keyframes import KeyframeConfig, references
 from processing.track.motion import MotionConfig, all_turns, change_cost, moved, steady_spin, turn_between
+from processing.track.multi_hypothesis import read_toss_track, write_toss_track
 from processing.track.optics import Optics
 from processing.track.register import register_tosses
-from processing.track.sequence import TossTrack, track_toss
-from processing.track.views import ViewConfig, cut, make_view
+from processing.track.sequence import TossTrack, TrackConfig, track_toss
+from processing.track.views import ViewConfig, ViewStore, cut, make_view
 from recordings.errors import BadInput
 from recordings.geometry import CameraModel, Transform, rotation_exp
 from recordings.records import RgbdFrame
@@ -206,7 +208,7 @@ def test_hidden_frames_are_interpolated_or_lost_but_never_silent(tiny_world: Any
     assert track.covariance[4, 0, 0] > track.covariance[3, 0, 0]
 
 
-def test_depth_exposed_half_a_frame_late_is_moved_to_the_color(tiny_world: Any) -> None:
+def test_depth_exposed_half_a_frame_late_is_moved_to_the_color(tiny_world: Any, tmp_path: Path) -> None:
     every_half = tiny_world.poses(16)
     frames, masks, truth = [], [], []
     for i in range(8):
@@ -215,9 +217,22 @@ def test_depth_exposed_half_a_frame_late_is_moved_to_the_color(tiny_world: Any) 
         frames.append(replace(now, depth_m=later.depth_m, depth_time_ns=now.time_ns + 16_666_667))
         masks.append(mask)
         truth.append((tiny_world.world_from_camera.inverse() @ every_half[2 * i]).matrix)
-    estimate = followed(tiny_world, (frames, masks)).track.camera_from_object
+    tracked = followed(tiny_world, (frames, masks))
+    estimate = tracked.track.camera_from_object
     errors = frame_errors(estimate @ align_first(estimate, np.stack(truth)), np.stack(truth), np.eye(3) * 0.05)
     assert np.median(errors.translation_m) < 0.008
+
+    write_toss_track(tmp_path, tracked)
+    kept = read_toss_track(tmp_path, 0, frames, masks, tiny_world.camera, np.ones(8), TrackConfig(),
+                           tiny_world.world_from_camera)  # fmt: skip
+    still = ViewStore(kept.store.optics, kept.store.crops, kept.store.config)
+    assert all(still.fill(i) for i in range(8))
+
+    def apart_m(store: ViewStore) -> float:
+        ours, theirs = store.maps[:, k.Z], tracked.store.maps[:, k.Z]
+        return float(np.abs(ours - theirs)[(ours > 0) & (theirs > 0)].mean())
+
+    assert apart_m(kept.store) < 0.1 * apart_m(still)
 
 
 def test_one_frame_is_enough(tiny_world: Any, toss: Any) -> None:
