@@ -150,7 +150,7 @@ def second_tracks(run: Run, name: str, drawn: Done, shape: Done, masks: Mapping[
         return {"fit": [round(float(f), 4) for f in together.fit]}
 
     config = {"register": run.matcher_settings(run.config.register), "together": True}
-    return {**tracks, **dict.fromkeys(seen, run.store.run("register", 1, config, inputs, compute))}
+    return {**tracks, **dict.fromkeys(seen, run.store.run("register", 2, config, inputs, compute))}
 
 
 def _second_track(run: Run, toss: int, drawn: Done, shape: Done, masks: Done) -> Done:
@@ -188,7 +188,7 @@ def _second_track(run: Run, toss: int, drawn: Done, shape: Done, masks: Done) ->
         return {"frames": len(frames), "lost": int(tracked.track.lost.sum())}
 
     config = {"track": run.matcher_settings(run.config.track), "start": run.config.cycle.start}
-    return run.store.run("track", 2, config, inputs, compute)
+    return run.store.run("track", 3, config, inputs, compute)
 
 
 def second_field(

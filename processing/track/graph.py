@@ -137,30 +137,43 @@ def refine(
     config: GraphConfig,
     held: Float[Array, "6"] | None = None,
     body: RoundBody | None = None,
+    tied: Int[Array, " n"] | None = None,
 ) -> Refined:
     """All poses in `use` at once; those in `fixed` stay. `poses` of other views are returned as they are. No pose moves
-    along the twist `held`, where there is one. A round body's profile is solved with them."""
+    along the twist `held`, where there is one. A round body's profile is solved with them. Views with the
+    same number in `tied` move as one (not at all with a fixed one); those with -1 move alone."""
     poses = poses.copy()
+    free = use & ~fixed
+    place = np.where(free, np.cumsum(free) - 1, -1)
+    if tied is not None:
+        place = _tied(place, np.where(use, tied, -1))
     pairs = choose_pairs(poses, use, motion.toss, motion.center_m, motion.still, config)
-    pairs = pairs[~fixed[pairs].all(1)]
+    pairs = pairs[place[pairs[:, 0]] != place[pairs[:, 1]]]
     distance = float(np.median(np.linalg.norm(store.center_m[use], axis=1)))
-    free = np.flatnonzero(use & ~fixed)
-    place = np.full(len(poses), -1)
-    place[free] = np.arange(len(free))
     figures = np.zeros((len(pairs), 3))
-    H = np.eye(6 * len(free))
+    H = np.eye(6 * (int(place.max(initial=-1)) + 1))
     for row in rows(config.schedule, distance, config.round_body):
         for _ in range(int(row[k.STEPS])):
             H, g, figures = _normal_equations(store, poses, use, pairs, place, row, motion, config, body)
             if held is not None:
                 _hold(H, held)
             step = -np.linalg.solve(H + np.diag(1e-6 * np.diag(H) + 1e-9), g).reshape(-1, 6)
-            for i, twist in zip(free, step):
+            for i in np.flatnonzero(place >= 0):
+                twist = step[place[i]]
                 size = max(np.linalg.norm(twist[:3]) / 0.03, np.linalg.norm(twist[3:]) / 0.2, 1.0)
                 poses[i] = poses[i] @ k.inverse(k.exponential(twist / size))
             if np.abs(step[:, :3]).max(initial=0) < 3e-5 and np.abs(step[:, 3:]).max(initial=0) < 3e-4:
                 break
-    return Refined(poses, _covariances(H, free, len(poses)), pairs, figures)
+    return Refined(poses, _covariances(H, place), pairs, figures)
+
+
+def _tied(place: Int[Array, " n"], tied: Int[Array, " n"]) -> Int[Array, " n"]:
+    """Unknowns (-1: none) of views, where those that are tied share theirs."""
+    out = place.copy()
+    for t in np.unique(tied[tied >= 0]):
+        out[tied == t] = out[tied == t].min()
+    left = np.unique(out[out >= 0])
+    return np.where(out >= 0, np.searchsorted(left, out), -1)
 
 
 def _hold(H: Float[Array, "f f"], held: Float[Array, "6"]) -> None:
@@ -300,12 +313,13 @@ def motion_residual(
     return residual, jacobians
 
 
-def _covariances(H: Float[Array, "d d"], free: Int[Array, " f"], n: int) -> Float[Array, "n 6 6"]:
+def _covariances(H: Float[Array, "d d"], place: Int[Array, " n"]) -> Float[Array, "n 6 6"]:
     """Each free view's own block of the inverse; zero for the fixed, NaN elsewhere is left to the caller."""
-    out = np.zeros((n, 6, 6))
+    out = np.zeros((len(place), 6, 6))
     inverse = np.linalg.inv(H + 1e-9 * np.trace(H) / max(len(H), 1) * np.eye(len(H)))
-    for a, i in enumerate(free):
-        out[i] = inverse[6 * a : 6 * a + 6, 6 * a : 6 * a + 6]
+    for i in np.flatnonzero(place >= 0):
+        a = 6 * place[i]
+        out[i] = inverse[a : a + 6, a : a + 6]
     return out
 
 

@@ -33,6 +33,7 @@ def write_toss_track(folder: Path, tracked: TossTrack) -> None:
             pairs=tracked.pairs,
             center_m=tracked.center_m,
             margin=np.array(tracked.margin),
+            round_body=np.array(tracked.round_body),
         )
 
 
@@ -62,6 +63,7 @@ def read_toss_track(
                 center_m=stored["center_m"],
                 margin=float(stored["margin"]),
                 store=store,
+                round_body=bool(stored["round_body"]),
             )
     except (OSError, KeyError, ValueError) as wrong:
         raise BadInput(

@@ -148,7 +148,8 @@ def register_tosses(
     fixed = pool.toss == root
     if model is None:
         fixed[1:] = False
-    poses = _refined(pool, np.isfinite(fit), placing.first_from_own, fixed, config)
+    whole = np.array([n if t.round_body else -1 for n, t in enumerate(tosses)] + [-1] * (count - len(tosses)))
+    poses = _refined(pool, np.isfinite(fit), placing.first_from_own, fixed, whole[pool.toss], config)
     fit, gap, first_from_own = fit[: len(tosses)], gap[: len(tosses)], placing.first_from_own[: len(tosses)]
     tracks = [_moved_track(toss, pool, t, poses, bool(np.isfinite(fit[t]))) for t, toss in enumerate(tosses)]
     joined = np.isfinite(fit)
@@ -186,17 +187,17 @@ def _gap(found: list[Fit]) -> float:
 
 def _refined(
     pool: Pool, joined: Bool[Array, " t"], first_from_own: Float[Array, "t 4 4"], fixed: Bool[Array, " n"],
-    config: RegisterConfig,
+    whole: Int[Array, " n"], config: RegisterConfig,
 ) -> Float[Array, "n 4 4"]:  # fmt: skip
     """All keyframes of all joined tosses at once (the first toss's first one is fixed, or a learned shape's views);
-    poses in the common frame."""
+    poses in the common frame. Views of a toss in `whole` (else -1) move as one."""
     poses = np.array([p @ np.linalg.inv(first_from_own[t]) for p, t in zip(pool.poses, pool.toss)])
     use = joined[pool.toss]
     none = np.zeros(len(poses), dtype=bool)
     # keyframes are far apart in time: the pull towards free flight says nothing between them
     motion = Motion(pool.frame.astype(np.float64), np.arange(len(poses)), np.zeros(3), pool.center_m, none)
     graph = replace(config.joint, spread_in_time=1)
-    return refine(pool.store, poses, use, fixed, motion, graph).poses
+    return refine(pool.store, poses, use, fixed, motion, graph, tied=whole).poses
 
 
 def _moved_track(

@@ -69,6 +69,8 @@ class TossTrack:
     margin: float
     """How much worse the best different story fits (infinite: there is none)."""
     store: ViewStore
+    round_body: bool = False
+    """Whether the body is round and its turn was found from all frames at once: pairs of views alone would spoil it."""
 
     @property
     def unfit(self) -> int:
@@ -354,4 +356,5 @@ def _told(
     for other in stories[1:]:
         if apart_deg(joint.poses[:n], other.joint.poses[:n]) > config.story.agreeing_deg:
             margin = min(margin, other.total - best.total)
-    return TossTrack(track, cost, on, keyframes, pairs, rejected, best.center_m, margin, scene.store)
+    return TossTrack(track, cost, on, keyframes, pairs, rejected, best.center_m, margin, scene.store,
+                     best.axis is not None)  # fmt: skip

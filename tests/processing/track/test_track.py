@@ -169,6 +169,16 @@ def tracked(tiny_world: Any, toss: Any) -> TossTrack:
     return followed(tiny_world, toss)
 
 
+@pytest.fixture(scope="module")
+def other(tiny_world: Any) -> tuple[list[RgbdFrame], list[np.ndarray], np.ndarray]:
+    return thrown(tiny_world, 1)
+
+
+@pytest.fixture(scope="module")
+def second(tiny_world: Any, other: Any) -> TossTrack:
+    return followed(tiny_world, other, toss=1)
+
+
 def test_a_known_motion_comes_back(toss: Any, tracked: TossTrack) -> None:
     estimate, truth = tracked.track.camera_from_object, toss[2]
     errors = frame_errors(estimate @ align_first(estimate, truth), truth, np.eye(3) * 0.05)
@@ -267,16 +277,21 @@ def test_a_lens_makes_no_difference() -> None:
     np.testing.assert_allclose(corners[0], corners[1], atol=0.004)
 
 
-def test_tosses_come_into_one_object_frame(tiny_world: Any, tracked: TossTrack, toss: Any) -> None:
-    other = thrown(tiny_world, 1)
-    second = followed(tiny_world, other, toss=1)
-    together = register_tosses([tracked, second])
+@pytest.mark.parametrize("round_body", [False, True])
+def test_tosses_come_into_one_object_frame(
+    tiny_world: Any, tracked: TossTrack, toss: Any, other: Any, second: TossTrack, round_body: bool
+) -> None:
+    tosses = [replace(t, round_body=round_body) for t in (tracked, second)]
+    together = register_tosses(tosses)
     assert together.joined == (True, True)
     assert together.ambiguous == (False, False)
     shift = align_first(together.tracks[0].camera_from_object, toss[2])
     error = frame_errors(together.tracks[1].camera_from_object @ shift, other[2], np.eye(3) * 0.05)
     assert np.median(error.rotation_deg) < 3.0
     assert np.median(error.translation_m) < 0.004
+    for own, common in zip(tosses, together.tracks):  # turns that were found from all frames stay
+        turns = np.linalg.inv(own.track.camera_from_object) @ common.camera_from_object
+        assert np.allclose(turns, turns[0], atol=1e-9) == round_body
 
 
 def test_no_toss_cannot_be_registered() -> None:
