@@ -122,7 +122,7 @@ def object_masks(run: Run, toss: int, scene: Done) -> Done:
 
     named = settings_of(run.config.backends.segmenter, run.config.backends)
     config = {"given_masks": choice, "background": asdict(run.config.masks), **named}
-    return run.store.run("segment", 4, config, inputs, compute)
+    return run.store.run("segment", 5, config, inputs, compute)
 
 
 def _given(run: Run, toss: int) -> dict[int, Bool[Array, "h w"]]:

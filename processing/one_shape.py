@@ -78,4 +78,4 @@ def _fused_stage(run: Run, together: Done, masks: Mapping[int, Done]) -> Done:
         write_shape(folder, grid_mesh(fuse(views, run.config.shape.field.fuse), seen[0].track.object_frame))
         return {"tosses": list(masks), "views": len(views)}
 
-    return run.store.run("fused", 2, run.config.shape.field.fuse, inputs, compute)
+    return run.store.run("fused", 3, run.config.shape.field.fuse, inputs, compute)

@@ -210,7 +210,7 @@ def second_field(
         return {"views": used, "vertices": len(learned.vertices_m)}
 
     config = {"shape": plain(run.config.shape), "start": run.config.cycle.start}
-    return run.store.run("field", 5, config, inputs, compute)
+    return run.store.run("field", 6, config, inputs, compute)
 
 
 def input_keys(tracks: Mapping[int, Done], masks: Mapping[int, Done]) -> dict[str, str]:

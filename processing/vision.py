@@ -149,7 +149,7 @@ def field_stage(run: Run, name: str, tracks: dict[int, Done], masks: dict[int, D
         unseen = 0.0 if shape.observed is None else float((~shape.observed).mean())
         return {"views": used, "vertices": len(shape.vertices_m), "unobserved_share": round(unseen, 4)}
 
-    return run.store.run("field", 4, config, inputs, compute)
+    return run.store.run("field", 5, config, inputs, compute)
 
 
 def _count(track: ObjectTrack) -> Counts:

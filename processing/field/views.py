@@ -26,7 +26,8 @@ class FieldView:
 
     `depth_m` is 0 where there is no trustworthy return on the object. `plane` is the local surface in camera
     coordinates as n with n . X = 1 (fitted to inverse depth). `outside` marks rays that surely pass the object.
-    `camera_from_object` is the pose at the colour exposure, `camera_from_object_at_depth` at the depth exposure.
+    `camera_from_object` is the pose at the colour exposure, `camera_from_object_at_depth` at the depth exposure, to
+    which colours and masks are moved: as a plane at the object's median depth moves.
     `colorless` marks pixels whose colour is not the object's (None: there are none).
     """
 
@@ -61,29 +62,48 @@ def make_view(
     pinhole = replace(camera, distortion_model="none", distortion=())
     maps = _undistortion(camera, pinhole)
     mask = _remap(mask.astype(np.uint8), maps, cv2.INTER_NEAREST) > 0
-    ys, xs = np.nonzero(mask)
-    if len(ys) == 0:
+    if not mask.any():
         return None
+    depth_m, color_rgb = _remap(frame.depth_m, maps, cv2.INTER_NEAREST), _remap(frame.color_rgb, maps, cv2.INTER_LINEAR)
+    foreign = None
+    if colorless is not None and colorless.any():
+        foreign = _dilate(_remap(colorless.astype(np.uint8), maps, cv2.INTER_NEAREST) > 0, 1)
+    motion = camera_from_object_at_depth @ np.linalg.inv(camera_from_object)
+    seen = depth_m[mask & (depth_m > 0)]
+    if len(seen) and not np.allclose(motion, np.eye(4), atol=1e-6):
+        moved = _plane_motion(motion, float(np.median(seen)), camera.K)
+        color_rgb = _warped(color_rgb, moved, cv2.INTER_LINEAR)
+        mask = _warped(mask.astype(np.uint8), moved, cv2.INTER_NEAREST) > 0
+        foreign = None if foreign is None else _warped(foreign.astype(np.uint8), moved, cv2.INTER_NEAREST) > 0
+        if not mask.any():
+            return None
+    ys, xs = np.nonzero(mask)
     box = (
         slice(max(ys.min() - MARGIN_PX, 0), ys.max() + MARGIN_PX + 1),
         slice(max(xs.min() - MARGIN_PX, 0), xs.max() + MARGIN_PX + 1),
     )
     mask = mask[box]
-    depth_m = _remap(frame.depth_m, maps, cv2.INTER_NEAREST)[box]
     K = camera.K.copy()
     K[0, 2] -= box[1].start
     K[1, 2] -= box[0].start
     inside, outside = _erode(mask, EDGE_PX // 2), ~_dilate(mask, EDGE_PX)
     if hidden is not None:
         outside &= ~_dilate(_remap(hidden.astype(np.uint8), maps, cv2.INTER_NEAREST)[box] > 0, EDGE_PX)
-    depth_m, plane = _trusted(np.where(inside, depth_m, 0).astype(np.float32), K)
-    color_rgb = _remap(frame.color_rgb, maps, cv2.INTER_LINEAR)[box]
-    foreign = None
-    if colorless is not None and colorless.any():
-        foreign = _dilate(_remap(colorless.astype(np.uint8), maps, cv2.INTER_NEAREST)[box] > 0, 1)
+    depth_m, plane = _trusted(np.where(inside, depth_m[box], 0).astype(np.float32), K)
     return FieldView(
-        K, color_rgb, depth_m, plane, inside, outside, camera_from_object, camera_from_object_at_depth, foreign
-    )
+        K, color_rgb[box], depth_m, plane, inside, outside, camera_from_object, camera_from_object_at_depth,
+        None if foreign is None else foreign[box],
+    )  # fmt: skip
+
+
+def _plane_motion(motion: Float[Array, "4 4"], depth_m: float, K: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
+    """Homography by which a plane that faces the camera at this depth is seen to make the motion (camera frame)."""
+    plane = motion[:3, :3] + np.outer(motion[:3, 3], [0.0, 0.0, 1.0 / depth_m])
+    return np.asarray(K @ plane @ np.linalg.inv(K))
+
+
+def _warped(image: Array, homography: Float[Array, "3 3"], how: int) -> Array:
+    return np.asarray(cv2.warpPerspective(image, homography, image.shape[1::-1], flags=how))
 
 
 def object_box(views: Sequence[FieldView], trim: float = 0.002) -> tuple[Float[Array, "3"], Float[Array, "3"]]:

@@ -151,6 +151,7 @@ def follow(
     if np.linalg.norm(way) > s.late.least_px:
         body = component_in(_moved_by_depth(frame, scene, block, s), _shifted(near, -way))
         frame = at_color_time(frame, scene, body, way, s.late)
+        s = replace(s, foreground=s.late.at_border(s.foreground))
     moved = moved_pixels(frame, scene, s.foreground)
     if (moved & ~scene.known).any():
         alike = memory.likeness.log_odds(frame.color_rgb) > 0

@@ -9,14 +9,14 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32
 from numpy import ndarray as Array
 
-from processing.segment.foreground import window_around
+from processing.segment.foreground import ForegroundSettings, shadow_distance, window_around
 from processing.segment.static_scene import StaticScene
 from recordings.records import RgbdFrame
 
 
 @dataclass(frozen=True)
 class LateDepthSettings:
-    """When depth is moved, and how far around the foretold place colour is asked."""
+    """When depth is moved, how far around the foretold place colour is asked, and what moved depth tells then."""
 
     least_px: float = 1.0
     """A smaller way between the exposures is left to the border's refinement."""
@@ -25,8 +25,26 @@ class LateDepthSettings:
     """The way is sought within so many pixels, and this share of it, around the foretold one."""
     color_step: float = 20.0
     """The least difference of colour from the scene that counts."""
+    darkest_shadow: float = 0.55
+    shadow: float = 0.3
+    """What may be the scene in a shadow, its own colour times at least `darkest_shadow`, counts so much: the object's
+    own shadow lies beside it and is no part of it."""
     pull: float = 0.002
     """Share of the object's pixels that a pixel off the foretold way must win."""
+    border_depth: float = 0.25
+    border_px: int = 4
+    """Moved depth counts so much less at the border, which is drawn anew so far to either side of it: the object has
+    turned, too."""
+
+    def at_border(self, s: ForegroundSettings) -> ForegroundSettings:
+        """How a pixel's evidence is weighed where depth was moved."""
+        return replace(
+            s,
+            weight_nearer=self.border_depth * s.weight_nearer,
+            weight_scene_depth=self.border_depth * s.weight_scene_depth,
+            band_inside_px=self.border_px,
+            band_outside_px=self.border_px,
+        )
 
 
 def way_px(frame: RgbdFrame, speed_px_s: Float[Array, "2"]) -> Float[Array, "2"]:
@@ -68,9 +86,12 @@ def at_color_time(
 def _unlike_scene(
     frame: RgbdFrame, scene: StaticScene, at: tuple[slice, slice], s: LateDepthSettings
 ) -> Float32[Array, "a b"]:
-    apart = np.abs(frame.color_rgb[at].astype(np.float32) - scene.color_rgb[at]).max(-1)
-    differs = apart > np.maximum(s.color_step, 4 * scene.color_sigma[at])
-    return np.where(scene.known[at], differs, 0.5).astype(np.float32)
+    """1 where the colour is not the scene's, less where it may be the scene's in a shadow."""
+    color, own = frame.color_rgb[at].astype(np.float32), scene.color_rgb[at]
+    least = np.maximum(s.color_step, 4 * scene.color_sigma[at])
+    other = np.where(shadow_distance(color, own, s.darkest_shadow) > least, 1.0, s.shadow)
+    unlike = np.where(np.abs(color - own).max(-1) > least, other, 0.0)
+    return np.where(scene.known[at], unlike, 0.5).astype(np.float32)
 
 
 def _moved(frame: RgbdFrame, scene: StaticScene, body: Bool[Array, "h w"], by_px: tuple[int, int]) -> RgbdFrame:

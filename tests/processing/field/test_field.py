@@ -13,7 +13,7 @@ from processing.field.fuse import FuseConfig, fuse
 from processing.field.learn import pose_at
 from processing.field.mesh import extract_mesh, grid_mesh
 from processing.field.train import FieldConfig, train_field
-from processing.field.views import FieldView, make_view
+from processing.field.views import FieldView, make_view, object_points
 from recordings.errors import BadInput
 from recordings.geometry import CameraModel
 from recordings.records import RgbdFrame
@@ -183,6 +183,26 @@ def test_the_same_seed_gives_the_same_field(views):
     first, second = train_field(views[:8], config), train_field(views[:8], config)
     assert first.losses == second.losses
     np.testing.assert_array_equal(first.views[3].camera_from_object, second.views[3].camera_from_object)
+
+
+def test_mask_and_colour_are_moved_to_where_late_depth_saw_the_object():
+    color_pose = looking_at_cube(Rotation.from_euler("xyz", [20, 30, 0], degrees=True))
+    depth_pose = looking_at_cube(Rotation.from_euler("xyz", [20, 30, 5], degrees=True))
+    depth_pose[:3, 3] += [0.01, 0.03, 0.0]  # 17 px
+    (frame, mask), (later, _) = draw(color_pose), draw(depth_pose)
+    view = make_view(replace(frame, depth_m=later.depth_m), mask, CAMERA, color_pose, depth_pose)
+    assert view is not None
+    points_m = object_points(view)
+    assert len(points_m) > 0.7 * mask.sum()
+    assert np.abs(distance_to_cube_m(points_m)).max() < 0.001
+    left, top = (CAMERA.K[:2, 2] - view.K[:2, 2]).astype(int)
+    h, w = view.outside.shape
+    _, there = draw(depth_pose)
+    assert (view.outside & there[top : top + h, left : left + w]).sum() < 0.002 * mask.sum()
+    size = np.sort(np.abs(points_m), axis=1)
+    inner = size[:, 1] < HALF_M - 0.006
+    red = np.array(RED_OF_FACE)[np.abs(points_m[inner]).argmax(1)]
+    assert np.mean(np.abs(view.color_rgb[view.depth_m > 0][inner, 0] - red) < 12) > 0.97
 
 
 def test_an_empty_mask_gives_no_view():
