@@ -17,7 +17,7 @@ from processing.track.middle import center_of_mass
 from processing.track.motion import MotionConfig, change_cost, turn_between
 from processing.track.round_axis import Axis, open_axis
 from processing.track.round_body import BodyConfig, RoundBody, anchored, is_round
-from processing.track.turns import TurnConfig, Turned, contradiction, doubted, turned
+from processing.track.turns import TurnConfig, Turned, contradiction, doubted, given_turns, turned
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,20 @@ def settled(scene: Scene, stories: list[Hypothesis], first: int, keep_first: boo
         steady = replace(config, graph=config.steady)
         smooth = refined(scene, replace(out[0].told, poses=out[0].joint.poses), first, keep_first, steady)
         out.append(refined(scene, replace(smooth.told, poses=smooth.joint.poses), first, keep_first, config))
-    return _again(_heard(scene, out, config), scene, first, keep_first, config)
+    best, *others = _again(_heard(scene, out, config), scene, first, keep_first, config)
+    return [_on_shape(scene, best, first, config) if len(scene.store) > n else best, *others]
+
+
+def _on_shape(scene: Scene, story: Story, first: int, config: StoryConfig) -> Story:
+    """A round body's story on a learned shape: its views hold the turns, but the poses that it was learned from may
+    have been wrong, so that the doubt is that which the frames themselves leave."""
+    poses = story.joint.poses[: len(scene.times_s)]
+    axis = open_axis(scene, poses, story.use, config.turns.axis)
+    if axis is None or not is_round(scene.store, poses, story.use, axis, config.body):
+        return story
+    given = given_turns(scene, poses, story.use, axis, config.turns)
+    said = _contradiction(scene, story, given, config)
+    return replace(story, turned=doubted(given, said, first, config.turns))
 
 
 def _heard(scene: Scene, stories: list[Story], config: StoryConfig) -> list[Story]:

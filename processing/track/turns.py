@@ -148,14 +148,7 @@ def turned(
     if len(frames.pairs) == 0:
         return Turned(poses, np.zeros(len(poses)), axis)
     step = 2 * np.pi / config.cells
-    charts = charts_of(scene, poses, frames.views, axis, config.cells, config.chart)
-    pace = _pace(scene, poses, frames, axis, config)
-    looks, shape = _said(charts, frames.pairs, config.cells // 2, None, config)
-    looks, shape = (_cyclic(c, config.cells) for c in (looks, -shape))
-    looks = np.minimum(np.maximum(_above_least(looks) - config.pair_dead, 0.0), config.most_looks)
-    shape = np.minimum(_above_least(shape), config.most_shape)
-    motion = np.array([config.spin_change_rad_s, config.fast_rad_s, config.fast_price])
-    rest = (frames.pairs, pace.base_rad, pace.steps_s, pace.still, pace.price, step, motion)
+    looks, shape, rest = _weighed(scene, poses, frames, axis, config)
     starts = [np.zeros(len(frames.views), dtype=np.int64)]
     starts += [np.round(_angles(poses[frames.views], r[frames.views], axis) / step).astype(np.int64) % config.cells
                for r in rivals]  # fmt: skip
@@ -164,12 +157,48 @@ def turned(
     if believed < config.trusted:
         trust = believed
         state = _sought(_near(trust * looks, shape), rest, [*starts, state], config)
-    sigma = np.sqrt(tk.spreads(state, _near(trust * looks, shape), *rest))
     out = _moved(poses, frames, state * step, axis, first)
-    spread = np.zeros(len(poses))
-    for run, s in zip(frames.runs, sigma):
-        spread[run] = s
+    spread = _spread(frames, _near(trust * looks, shape), rest, state, len(poses))
     return steady(scene, Turned(out, spread, axis, trust), use, first, config)
+
+
+def given_turns(
+    scene: Scene, poses: Float[Array, "n 4 4"], use: Bool[Array, " n"], axis: Axis, config: TurnConfig
+) -> Turned:
+    """The poses as they are, with the doubt that all frames together leave about their turns."""
+    frames = _frames(scene, use, config)
+    if len(frames.pairs) == 0:
+        return Turned(poses, np.zeros(len(poses)), axis)
+    looks, shape, rest = _weighed(scene, poses, frames, axis, config)
+    state = np.zeros(len(frames.views), dtype=np.int64)
+    believed = _believed(looks, frames.pairs, state, config)
+    trust = believed if believed < config.trusted else 1.0
+    return Turned(poses, _spread(frames, _near(trust * looks, shape), rest, state, len(poses)), axis, trust)
+
+
+def _weighed(
+    scene: Scene, poses: Float[Array, "n 4 4"], frames: _Frames, axis: Axis, config: TurnConfig
+) -> tuple[Float[Array, "m c"], Float[Array, "m c"], tuple[object, ...]]:
+    """What each pair says against all turns of its two views, by looks and by shape, and what else the search needs."""
+    charts = charts_of(scene, poses, frames.views, axis, config.cells, config.chart)
+    pace = _pace(scene, poses, frames, axis, config)
+    looks, shape = _said(charts, frames.pairs, config.cells // 2, None, config)
+    looks, shape = (_cyclic(c, config.cells) for c in (looks, -shape))
+    looks = np.minimum(np.maximum(_above_least(looks) - config.pair_dead, 0.0), config.most_looks)
+    shape = np.minimum(_above_least(shape), config.most_shape)
+    motion = np.array([config.spin_change_rad_s, config.fast_rad_s, config.fast_price])
+    step = 2 * np.pi / config.cells
+    return looks, shape, (frames.pairs, pace.base_rad, pace.steps_s, pace.still, pace.price, step, motion)
+
+
+def _spread(
+    frames: _Frames, costs: Float[Array, "m c"], rest: tuple[object, ...], state: Int[Array, " v"], count: int
+) -> Float[Array, " n"]:
+    """Standard deviation (rad) of each frame's turn around those found."""
+    out = np.zeros(count)
+    for run, s in zip(frames.runs, np.sqrt(tk.spreads(state, costs, *rest))):
+        out[run] = s
+    return out
 
 
 def _believed(

@@ -6,9 +6,12 @@ import numpy as np
 import pytest
 
 from processing.track import kernels as k
+from processing.track.beam import Scene
+from processing.track.features import Sift
 from processing.track.optics import Optics
 from processing.track.round_axis import Axis
 from processing.track.round_body import BodyConfig, RoundBody, anchored, is_round
+from processing.track.turns import TurnConfig, given_turns
 from processing.track.views import Crop, ViewConfig, ViewStore
 from recordings.geometry import CameraModel, rotation_exp
 
@@ -126,6 +129,19 @@ def test_outlines_say_whether_a_body_is_round_about_an_axis(cans: tuple[ViewStor
     every = np.ones(len(truth), dtype=bool)
     assert is_round(store, truth, every, AXIS, BodyConfig())
     assert not is_round(store, truth, every, Axis(np.array([1.0, 0.0, 0.0]), np.zeros(3)), BodyConfig())
+
+
+def test_given_turns_of_a_can_that_nothing_marks_stay_and_are_doubted_more_and_more() -> None:
+    poses = can_poses()
+    store = can(poses)
+    assert all(store.fill(n) for n in range(len(poses)))
+    scene = Scene(store, np.arange(len(poses)) / 30, np.zeros(3), np.zeros(3), Sift())
+    told = given_turns(scene, poses, np.ones(len(poses), dtype=bool), AXIS, TurnConfig())
+    np.testing.assert_array_equal(told.poses, poses)
+    doubted_deg = np.degrees(told.sigma_rad)
+    assert doubted_deg[0] == 0
+    assert (np.diff(doubted_deg) > 0).all()
+    assert doubted_deg[-1] > 10
 
 
 def test_an_anchored_view_keeps_its_pose_and_the_axis_its_place_in_space() -> None:
