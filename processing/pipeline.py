@@ -206,15 +206,15 @@ def _all_together(run: Run, once: Mapping[int, Done], masks: Mapping[int, Done])
         warnings.append(f"tosses {unsure}: the object looks alike from several sides; their object frame may be turned")
     joined = [t for t in run.tosses if t not in left_out]
     shape = field_stage(run, "all tosses", dict.fromkeys(joined, together), {t: masks[t] for t in joined})
-    kept, apart = of_one_shape(run, together, shape, masks, joined)
+    _, apart = of_one_shape(run, together, shape, masks, joined)
     if apart:
-        warnings.append(
-            f"tosses {apart}: their place among the others is wrong, no one shape explains both: kept apart"
-        )
-        shape = field_stage(run, "all tosses", dict.fromkeys(kept, together), {t: masks[t] for t in kept})
-    there = [t for t in run.tosses if t not in apart]
-    return Pass({t: tracks[t] for t in there}, dict.fromkeys(there, shape), {t: masks[t] for t in there},
-                shared_frame=not apart, warnings=tuple(warnings))  # fmt: skip
+        there = tuple(t for t in run.tosses if t not in apart)  # joined anew: they were refined together with the wrong
+        warning = f"tosses {apart}: their place among the others is wrong, no one shape explains both: kept apart"
+        left = _all_together(replace(run, tosses=there), {t: once[t] for t in there}, {t: masks[t] for t in there})
+        warnings = [*_unfit({t: once[t] for t in apart}), warning, *left.warnings]
+        return replace(left, shared_frame=False, warnings=tuple(warnings))
+    return Pass(tracks, dict.fromkeys(run.tosses, shape), {t: masks[t] for t in run.tosses}, shared_frame=True,
+                warnings=tuple(warnings))  # fmt: skip
 
 
 def _with_apart(run: Run, last: Pass, once: Mapping[int, Done], masks: Mapping[int, Done]) -> Pass:

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
+from processing import pipeline
 from processing.config import Config
 from processing.one_shape import _fused_stage, _left, of_one_shape
 from processing.pipeline import Run, start_run
@@ -69,3 +70,30 @@ def test_tosses_whose_masks_are_bad_alike_are_not_kept_apart(tiny_world: Any, tm
     left = _left(run, together, dict.fromkeys((0, 1), fused), masks)
     assert max(left.values()) > run.config.cycle.apart_mask
     assert of_one_shape(run, together, _fused_stage(run, together, masks), masks, [0, 1]) == ([0, 1], [])
+
+
+def test_the_others_are_joined_anew_without_a_toss_that_is_kept_apart(
+    tiny_world: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    session = Session.open(tiny_world.record(tmp_path / "tiny", tosses=(0, 1, 2), frames=2))
+    run = start_run(session, session.tosses, tmp_path / "out", Config(), "multi-hypothesis", lambda _: Silent())
+    once = {t: Done(tmp_path, f"track {t}", {"unfit": int(t == 1)}, False) for t in run.tosses}
+    masks = {t: Done(tmp_path, f"masks {t}", {}, False) for t in run.tosses}
+
+    def register(_: Run, tracks: dict[int, Done], __: dict[int, Done]) -> Done:
+        return Done(tmp_path, f"together {sorted(tracks)}", {"not_joined": []}, False)
+
+    def field(_: Run, name: str, tracks: dict[int, Done], __: dict[int, Done]) -> Done:
+        return Done(tmp_path, f"{name} {sorted(tracks)}", {}, False)
+
+    def one_shape(_: Run, __: Done, ___: Done, ____: dict[int, Done], joined: list[int]) -> tuple[list[int], list[int]]:
+        return [t for t in joined if t != 1], [t for t in joined if t == 1]
+
+    for name, fake in (("register_stage", register), ("field_stage", field), ("of_one_shape", one_shape)):
+        monkeypatch.setattr(pipeline, name, fake)
+    found = pipeline._all_together(run, once, masks)
+    assert {t: d.key for t, d in found.tracks.items()} == {0: "together [0, 2]", 2: "together [0, 2]"}
+    assert {d.key for d in found.shapes.values()} == {"all tosses [0, 2]"}
+    assert list(found.masks) == [0, 2]
+    assert not found.shared_frame
+    assert [w.split(":")[0] for w in found.warnings] == ["toss 1", "tosses [1]"]
