@@ -171,7 +171,7 @@ def follow(
         unknown = unknown & (scene.depth_m == 0)
     strange = (wide & unknown).sum() > s.unknown * rough.sum()
     larger = rough.sum() > s.grown * area
-    if strange or (larger and not _is_all_object(frame, rough, expected, memory, s)):
+    if strange or (larger and not _is_all_object(frame, rough, expected, memory, float(np.linalg.norm(way)), s)):
         rough = _among_others(frame, scene, moved, expected, memory, beside, s)
         if rough.sum() < s.least_px:
             return Found(np.zeros_like(rough), 0.0, others_px, True)
@@ -223,16 +223,18 @@ def _is_all_object(
     rough: Bool[Array, "h w"],
     expected: Bool[Array, "h w"],
     memory: Memory,
+    way_px: float,
     s: BackgroundSettings,
 ) -> bool:
     """Whether what has grown on the object is its own, as of a box that turns its broad side.
 
-    It does not reach far, in the image or in depth, and nothing else was near that could have touched it. Its colours
-    say nothing: a box that spins shows a side in this frame that it never showed before.
+    It does not reach far, in the image (more where it moves by `way_px` between the exposures, which an impact changes)
+    or in depth, and nothing else was near that could have touched it. Its colours say nothing: a box that spins shows a
+    side in this frame that it never showed before.
     """
     added = rough & ~expected
     reach = cv2.distanceTransform((~expected).astype(np.uint8), cv2.DIST_L2, 3)[added]
-    if memory.others_near or np.quantile(reach, 0.95) > s.turned * np.sqrt(memory.mask.sum()):
+    if memory.others_near or np.quantile(reach, 0.95) > s.turned * np.sqrt(memory.mask.sum()) + way_px:
         return False
     low, high = memory.depth_range_m
     depth = frame.depth_m[added & (frame.depth_m > 0)]

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from processing.segment.follow import BackgroundSettings, Found, follow, remember
+from processing.segment.follow import BackgroundSettings, Found, _is_all_object, follow, remember
 from processing.segment.late_depth import LateDepthSettings, at_color_time, way_px
 from processing.segment.static_scene import StaticScene
 from recordings.records import RgbdFrame
@@ -63,3 +63,12 @@ def test_late_depth_is_not_put_on_the_bodys_shadow() -> None:
     foretold = np.array([-3.0, -1.0])  # there it would cover nothing but itself and its shadow
     found = at_color_time(late, empty_scene(), depth.depth_m < 0.9, foretold, LateDepthSettings())
     np.testing.assert_array_equal(found.depth_m, color.depth_m)
+
+
+@pytest.mark.parametrize(("way_px", "own"), [(0.0, False), (6.0, True)])
+def test_a_body_may_lie_off_the_expected_place_by_its_way_between_the_exposures(way_px: float, own: bool) -> None:
+    expected, rough = np.zeros((H, W), dtype=bool), np.zeros((H, W), dtype=bool)
+    expected[BEFORE], rough[40:70, 50:102] = True, True  # 22 px more; 0.6 of its size are 18
+    seen = frame((np.s_[40:70, 50:102], RED, 0.7))
+    memory = remember(None, seen, Found(expected, 1.0))
+    assert _is_all_object(seen, rough, expected, memory, way_px, BackgroundSettings()) == own
