@@ -59,7 +59,7 @@ class Charts:
     odd: Float[Array, "v q c"]
     sides: Float[Array, "v 3 q c"]
     free: Float[Array, "v q c"]
-    standing: list[Float32[Array, "p s"]]
+    standing: list[Float32[Array, "_ s"]]
 
 
 @dataclass(frozen=True, eq=False)

@@ -39,6 +39,8 @@ class StoryConfig:
     round_body: GraphConfig = field(default_factory=round_views)
     """Refinement of a round body, whose turn stays as it was found."""
     body: BodyConfig = field(default_factory=BodyConfig)
+    round_badness: float = 1.4
+    """A body whose views fit so many times worse on one profile is not round: a blurred box may look so."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +76,7 @@ def settled(scene: Scene, stories: list[Hypothesis], first: int, keep_first: boo
     out = [refined(scene, s, first, keep_first, config) for s in (stories[:1] if agree else stories)]
     out.sort(key=lambda s: s.badness)
     sought = _sought(scene, out, first, keep_first, config) if len(stories) > 1 else None
-    if sought is not None:
+    if sought is not None and sought.badness < config.round_badness * out[0].badness:
         return _again([sought], scene, first, keep_first, replace(config, graph=config.round_body))
     out = _heard(scene, out, config)
     if not agree and any(_leave_open(out[0].joint.poses[:n], s.joint.poses[:n], config) for s in out[1:]):
@@ -108,7 +110,7 @@ def _heard(scene: Scene, stories: list[Story], config: StoryConfig) -> list[Stor
 
 
 def _sought(scene: Scene, stories: list[Story], first: int, keep_first: bool, config: StoryConfig) -> Story | None:
-    """A round body's story with the turns that all frames together say; None where the stories say the same."""
+    """A round body's story with the turns that all frames together say; None where the body is not round."""
     n, best = len(scene.times_s), stories[0]
     axis = open_axis(scene, best.joint.poses[:n], best.use, config.turns.axis)
     if axis is None or len(scene.store) > n:

@@ -259,7 +259,7 @@ def _moved(
 
 
 def turns_of_standing(
-    store: ViewStore, poses: Float[Array, "v 4 4"], frames: _Frames, standing: list[Float32[Array, "p s"]], axis: Axis,
+    store: ViewStore, poses: Float[Array, "v 4 4"], frames: _Frames, standing: list[Float32[Array, "_ s"]], axis: Axis,
     config: TurnConfig,
 ) -> Normal:  # fmt: skip
     """How the turns of the frames' views (at `poses`) should change so that what stands off the body in one lies on its

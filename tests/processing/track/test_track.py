@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from processing.metrics import align_first, frame_errors
 from processing.track import kernels as k
+from processing.track import story
 from processing.track.features import rigid_fit
 from processing.track.flags import camera_covariance
 from processing.track.graph import GraphConfig, Motion, _add_motion, flight_center
@@ -21,6 +22,7 @@ from processing.track.motion import MotionConfig, all_turns, change_cost, moved,
 from processing.track.multi_hypothesis import read_toss_track, write_toss_track
 from processing.track.optics import Optics
 from processing.track.register import register_tosses
+from processing.track.round_axis import Axis
 from processing.track.sequence import TossTrack, TrackConfig, track_toss
 from processing.track.views import ViewConfig, ViewStore, cut, make_view
 from recordings.errors import BadInput
@@ -193,6 +195,19 @@ def test_the_object_frame_starts_parallel_to_the_camera_in_the_cloud(toss: Any, 
     first = tracked.track.camera_from_object[0]
     np.testing.assert_array_equal(first[:3, :3], np.eye(3))
     assert np.linalg.norm(first[:3, 3] - toss[2][0, :3, 3]) < 0.05
+
+
+@pytest.mark.parametrize(("worse", "taken"), [(1.2, True), (2.0, False)])
+def test_a_body_that_looks_round_is_told_by_how_badly_the_profile_fits(
+    tiny_world: Any, toss: Any, tracked: TossTrack, monkeypatch: pytest.MonkeyPatch, worse: float, taken: bool
+) -> None:
+    axis = Axis(np.array([0.0, 0.0, 1.0]), tracked.center_m)
+
+    def sought(_: Any, stories: list[story.Story], *__: Any) -> story.Story:
+        return replace(stories[0], badness=worse * stories[0].badness, axis=axis)
+
+    monkeypatch.setattr(story, "_sought", sought)
+    assert followed(tiny_world, toss).round_body == taken
 
 
 def test_a_given_start_is_kept(tiny_world: Any, toss: Any) -> None:
