@@ -316,7 +316,7 @@ def motion_residual(
 def _covariances(H: Float[Array, "d d"], place: Int[Array, " n"]) -> Float[Array, "n 6 6"]:
     """Each free view's own block of the inverse; zero for the fixed, NaN elsewhere is left to the caller."""
     out = np.zeros((len(place), 6, 6))
-    inverse = np.linalg.inv(H + 1e-9 * np.trace(H) / max(len(H), 1) * np.eye(len(H)))
+    inverse = np.linalg.inv(H + 1e-9 * (1 + np.trace(H) / max(len(H), 1)) * np.eye(len(H)))
     for i in np.flatnonzero(place >= 0):
         a = 6 * place[i]
         out[i] = inverse[a : a + 6, a : a + 6]

@@ -16,7 +16,7 @@ from processing.track import kernels as k
 from processing.track import story
 from processing.track.features import rigid_fit
 from processing.track.flags import camera_covariance
-from processing.track.graph import GraphConfig, Motion, _add_motion, flight_center
+from processing.track.graph import GraphConfig, Motion, _add_motion, flight_center, refine
 from processing.track.keyframes import KeyframeConfig, references
 from processing.track.motion import MotionConfig, all_turns, change_cost, moved, steady_spin, turn_between
 from processing.track.multi_hypothesis import read_toss_track, write_toss_track
@@ -307,6 +307,17 @@ def test_tosses_come_into_one_object_frame(
     for own, common in zip(tosses, together.tracks):  # turns that were found from all frames stay
         turns = np.linalg.inv(own.track.camera_from_object) @ common.camera_from_object
         assert np.allclose(turns, turns[0], atol=1e-9) == round_body
+
+
+def test_views_that_no_pair_ties_to_others_stay_and_nothing_is_known_of_them(tracked: TossTrack) -> None:
+    n = len(tracked.cost)
+    poses, all_of_them = tracked.track.camera_from_object, np.ones(n, dtype=bool)
+    alone = Motion(np.arange(n) / 30, np.arange(n), np.zeros(3), tracked.center_m, ~all_of_them)
+    config = GraphConfig(neighbours=0, loops=0)
+    found = refine(tracked.store, poses, all_of_them, np.arange(n) == 0, alone, config, tied=np.arange(n) // 5)
+    np.testing.assert_array_equal(found.poses, poses)
+    assert not found.covariance[:5].any()
+    assert (np.diagonal(found.covariance[5:], axis1=1, axis2=2) > 1e6).all()
 
 
 def test_no_toss_cannot_be_registered() -> None:
