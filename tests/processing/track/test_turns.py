@@ -129,6 +129,8 @@ def test_a_stretch_that_shows_nothing_turns_as_steadily_as_what_is_seen_around_i
     np.testing.assert_allclose(start + angle, truth, atol=np.radians(1.5))
     assert sigma[0] == 0
     assert sigma[15] > 2 * sigma[5]
+    once = steadied(costs, pairs, nothing, moved, cell, 0, SteadyConfig(tails=1.0))[1]
+    np.testing.assert_allclose(sigma, SteadyConfig().tails * once)
 
 
 def test_looks_of_one_colour_say_nothing_and_a_label_says_where_it_is() -> None:
