@@ -23,12 +23,12 @@ class FakeGvCamera:
     """One camera, until closed. `lost_per_mille` of its packets never arrive."""
 
     def __init__(self, address: str, serial: str, lost_per_mille: int = 0) -> None:
-        program = shutil.which(PROGRAM)
+        host, program = loopback(address), shutil.which(PROGRAM)
         if program is None:
             raise DeviceNotFound(
                 f"no {PROGRAM}; as root, run `apt-get install -y --no-install-recommends aravis-tools`"
             )
-        command = [program, "-i", loopback(address), "-s", serial, "-r", str(lost_per_mille)]
+        command = [program, "-i", host, "-s", serial, "-r", str(lost_per_mille)]
         self._process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         time.sleep(STARTUP_S)
 
