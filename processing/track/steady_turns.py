@@ -28,7 +28,7 @@ class SteadyConfig:
     """In a hand, on the table; impacts are outliers (Cauchy)."""
     steps: int = 40
     tails: float = 3.0
-    """Those changes have heavy tails: turns err by this times what the usual ones make (on 29 simulated mugs)."""
+    """Those changes have heavy tails: turns err by this times what the usual ones make (28 simulated tosses)."""
     most: float = 4.0
     """Cells that a view turns by in one step."""
 
