@@ -148,9 +148,10 @@ def follow(
     reach = reach_px(area, memory.missed + 1)
     near = grown(expected, min(reach, 150))
     way = way_px(frame, memory.speed_px_s)
-    if np.linalg.norm(way) > s.late.least_px:
+    far_px = float(np.linalg.norm(way))
+    if far_px > s.late.least_px:
         body = component_in(_moved_by_depth(frame, scene, block, s), _shifted(near, -way))
-        frame = at_color_time(frame, scene, body, way, s.late)
+        frame = at_color_time(frame, scene, body, way, s.late, s.foreground)
         s = replace(s, foreground=s.late.at_border(s.foreground))
     moved = moved_pixels(frame, scene, s.foreground)
     if (moved & ~scene.known).any():
@@ -171,7 +172,7 @@ def follow(
         unknown = unknown & (scene.depth_m == 0)
     strange = (wide & unknown).sum() > s.unknown * rough.sum()
     larger = rough.sum() > s.grown * area
-    if strange or (larger and not _is_all_object(frame, rough, expected, memory, float(np.linalg.norm(way)), s)):
+    if strange or (larger and not _is_all_object(frame, rough, expected, memory, far_px, s)):
         rough = _among_others(frame, scene, moved, expected, memory, beside, s)
         if rough.sum() < s.least_px:
             return Found(np.zeros_like(rough), 0.0, others_px, True)

@@ -25,10 +25,8 @@ class LateDepthSettings:
     """The way is sought within so many pixels, and this share of it, around the foretold one."""
     color_step: float = 20.0
     """The least difference of colour from the scene that counts."""
-    darkest_shadow: float = 0.55
     shadow: float = 0.3
-    """What may be the scene in a shadow, its own colour times at least `darkest_shadow`, counts so much: the object's
-    own shadow lies beside it and is no part of it."""
+    """What may be the scene in a shadow counts so much: the object's own shadow lies beside it and is no part of it."""
     pull: float = 0.002
     """Share of the object's pixels that a pixel off the foretold way must win."""
     border_depth: float = 0.25
@@ -58,6 +56,7 @@ def at_color_time(
     body: Bool[Array, "h w"],
     foretold_px: Float[Array, "2"],
     s: LateDepthSettings,
+    look: ForegroundSettings,
 ) -> RgbdFrame:
     """The frame with the depth of `body` (its pixels in the depth image) moved by the whole pixels, near `foretold_px`,
     after which it covers most of what does not look like the scene; behind it the scene's depth."""
@@ -68,7 +67,7 @@ def at_color_time(
         return frame
     part = window_around(body, 0)
     assert part is not None
-    strange = _unlike_scene(frame, scene, at, s)
+    strange = _unlike_scene(frame, scene, at, s, look)
     template = body[part].astype(np.float32)
     steps = [(dx, dy) for dy in range(-reach, reach + 1) for dx in range(-reach, reach + 1)]
     top, left = part[0].start - at[0].start, part[1].start - at[1].start
@@ -84,12 +83,12 @@ def at_color_time(
 
 
 def _unlike_scene(
-    frame: RgbdFrame, scene: StaticScene, at: tuple[slice, slice], s: LateDepthSettings
+    frame: RgbdFrame, scene: StaticScene, at: tuple[slice, slice], s: LateDepthSettings, look: ForegroundSettings
 ) -> Float32[Array, "a b"]:
     """1 where the colour is not the scene's, less where it may be the scene's in a shadow."""
     color, own = frame.color_rgb[at].astype(np.float32), scene.color_rgb[at]
     least = np.maximum(s.color_step, 4 * scene.color_sigma[at])
-    other = np.where(shadow_distance(color, own, s.darkest_shadow) > least, 1.0, s.shadow)
+    other = np.where(shadow_distance(color, own, look.darkest_shadow) > least, 1.0, s.shadow)
     unlike = np.where(np.abs(color - own).max(-1) > least, other, 0.0)
     return np.where(scene.known[at], unlike, 0.5).astype(np.float32)
 

@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 
 from acquisition.clock import SessionClock
+from acquisition.drivers.aravis import Aravis
 from acquisition.drivers.synthetic import SyntheticConfig, SyntheticLab, SyntheticThrower
 from acquisition.operator import Nobody
 from acquisition.recorder import Recorder
@@ -19,6 +20,7 @@ from acquisition.rig import DeviceEntry, RecordingConfig, Rig
 from acquisition.run import Options, SessionReport, SessionRun, TossReport
 from acquisition.streams import Tally
 from acquisition.verdict import Verdict
+from recordings.errors import DeviceNotFound
 from recordings.progress import Silent
 from recordings.session_writer import SessionWriter
 
@@ -151,3 +153,11 @@ def record(tmp_path: Path) -> Callable[..., Recorded]:
         return Recorded(folder, report, recorder.tallies(), clocks, operator, spent.seconds, lab)
 
     return run
+
+
+@pytest.fixture
+def needs_aravis() -> None:
+    try:
+        Aravis.get()
+    except DeviceNotFound as missing:
+        pytest.skip(str(missing))

@@ -15,8 +15,6 @@ import pytest
 from acquisition.cli import main
 from acquisition.doctor import doctor
 from acquisition.drivers import usb
-from acquisition.drivers.aravis import Aravis
-from recordings.errors import DeviceNotFound
 from recordings.verify import verify
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -65,15 +63,12 @@ ARM = 'name = "lab"\n[devices.arm]\nkind = "arm"\nrate_hz = {}\ndriver = "{}"\na
     ],
 )
 def test_what_cannot_be_recorded_is_refused_before_anything_is_written(
-    rig: str, says: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    rig: str, says: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], request: pytest.FixtureRequest
 ) -> None:
     if "franka" in rig or '"ur"' in rig:
         pytest.importorskip("panda_py" if "franka" in rig else "rtde_control")
     if rig == MONO:
-        try:
-            Aravis.get()
-        except DeviceNotFound as missing:
-            pytest.skip(str(missing))
+        request.getfixturevalue("needs_aravis")
     path, out = tmp_path / "rig.toml", tmp_path / "out"
     path.write_text(rig)
     assert main(["--rig", str(path), "--yes", str(out)]) == 2

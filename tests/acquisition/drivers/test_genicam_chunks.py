@@ -10,20 +10,11 @@ import numpy as np
 import pytest
 
 from acquisition.devices import Image
-from acquisition.drivers.aravis import Aravis
 from acquisition.drivers.genicam import GenicamCamera, GenicamSettings
 from acquisition.simulators.gige_camera import GigeCamera
-from recordings.errors import DeviceNotFound
 
+pytestmark = pytest.mark.usefixtures("needs_aravis")
 SETTINGS = GenicamSettings(width=320, height=240, rate_hz=50.0, packet_bytes=1400)
-
-
-@pytest.fixture(autouse=True)
-def needs_aravis() -> None:
-    try:
-        Aravis.get()
-    except DeviceNotFound as missing:
-        pytest.skip(str(missing))
 
 
 def test_chunks_carry_each_images_own_start_of_exposure_time_and_gain(loopback_network: list[str]) -> None:
