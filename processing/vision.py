@@ -54,7 +54,7 @@ def track_stage(run: Run, toss: int, masks: Done) -> Done:
         write_notes(folder, toss, *notes_of(tracked, run.matcher))
         return {**_count(tracked.track), "unfit": tracked.unfit}
 
-    return run.store.run("track", 5, run.matcher_settings(run.config.track), inputs, compute)
+    return run.store.run("track", 6, run.matcher_settings(run.config.track), inputs, compute)
 
 
 def model_stage(run: Run, model: Path) -> Done:
@@ -93,7 +93,7 @@ def model_track_stage(run: Run, toss: int, masks: Done, model: Done) -> Done:
         write_notes(folder, toss, *notes_of(tracked, run.matcher))
         return {**_count(tracked.track), "unfit": tracked.unfit}
 
-    return run.store.run("track", 5, run.matcher_settings(run.config.track), inputs, compute)
+    return run.store.run("track", 6, run.matcher_settings(run.config.track), inputs, compute)
 
 
 def register_stage(run: Run, tracks: dict[int, Done], masks: dict[int, Done]) -> Done:

@@ -52,7 +52,8 @@ class Charts:
     """`looks` (v, r, c, 2): two differences of colour without the light, mean per cell; `count` (v, r, c): pixels.
     `odd` (v, q, c): share of cells where something stands off the body, `sides` (v, 3, q, c) the same by the side that
     was seen; `free` (v, q, c): 1 where nothing stands. Rows r: outside by height, both ends by radius; q: layers times
-    heights; c: angles about the axis. `standing`: per view the pixels of what stands off the body, as samples."""
+    heights; c: angles about the axis. `standing`: per view the pixels of what stands off the body, as samples. `rings`:
+    place along the axis and radius of the round body's circles, its ends' included."""
 
     looks: Float[Array, "v r c 2"]
     count: Float[Array, "v r c"]
@@ -60,6 +61,7 @@ class Charts:
     sides: Float[Array, "v 3 q c"]
     free: Float[Array, "v q c"]
     standing: list[Float32[Array, "_ s"]]
+    rings: Float[Array, "h 2"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +110,9 @@ def charts_of(
         standing.append(p.samples[off])
     mean /= np.maximum(count, 1)[..., None]
     anyhow = np.minimum(odd.sum(1), 3) / 3
-    return Charts(mean, count, anyhow, np.minimum(odd, 3) / 3, free * (anyhow == 0), standing)
+    rings = np.column_stack([np.clip(low + (np.arange(heights) + 0.5) * config.row_m, low, high), profile])
+    rings = np.concatenate([[[low, profile[0]]], rings, [[high, profile[-1]]]])
+    return Charts(mean, count, anyhow, np.minimum(odd, 3) / 3, free * (anyhow == 0), standing, rings)
 
 
 def across(axis: Axis) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
@@ -262,9 +266,17 @@ def _free(
 
 def _heights(store: ViewStore, view: int, places: Float[Array, "q c 3"]) -> Float[Array, "q c"]:
     """Height above the table of places in camera axes; infinite where the table is not known."""
+    plane = table_of(store, view)
+    if plane is None:
+        return np.full(places.shape[:-1], np.inf)
+    return np.asarray(places @ plane[:3] + plane[3])
+
+
+def table_of(store: ViewStore, view: int) -> Float[Array, "4"] | None:
+    """The table's plane (camera axes): height above it is plane[:3] @ p + plane[3]; None where it is not known."""
     crop = store.crops[view]
     if crop is None or crop.height_m is None:
-        return np.full(places.shape[:-1], np.inf)
+        return None
     v, u = np.nonzero(crop.depth_m > 0)
     some = slice(None, None, max(len(u) // 200, 1))
     u, v = u[some], v[some]
@@ -272,5 +284,4 @@ def _heights(store: ViewStore, view: int, places: Float[Array, "q c 3"]) -> Floa
     rays = np.stack([(u + crop.corner[0] - center[0]) / focal[0], (v + crop.corner[1] - center[1]) / focal[1]], -1)
     z = crop.depth_m[v, u].astype(np.float64)
     seen = np.column_stack([rays * z[:, None], z, np.ones(len(z))])
-    plane = np.linalg.lstsq(seen, crop.height_m[v, u].astype(np.float64), rcond=None)[0]
-    return np.asarray(places @ plane[:3] + plane[3])
+    return np.asarray(np.linalg.lstsq(seen, crop.height_m[v, u].astype(np.float64), rcond=None)[0])

@@ -1,16 +1,21 @@
 """The turns of all views at once, off the grid: where the images leave a turn open, the motion tells it.
 
 A round body's spin about its axis is constant in free flight (Euler's equations with two equal moments of inertia), so
-that what is seen before and after a stretch in which nothing tells the turn fixes that stretch too.
+that what is seen before and after a stretch in which nothing tells the turn fixes that stretch too. On the table it
+rolls (rolling.py).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray as Array
+
+from processing.track.beam import Scene
+from processing.track.rolling import Grounded, RollConfig, Rolled, rolled
+from recordings.geometry import rotation_log
 
 STARTING = 0.6
 """A start from rest changes the spin over its first step by half of what the same acceleration does later."""
@@ -31,18 +36,47 @@ class SteadyConfig:
     """Those changes have heavy tails: turns err by this times what the usual ones make (28 simulated tosses)."""
     most: float = 4.0
     """Cells that a view turns by in one step."""
+    flight_price: float = 4.0
+    """Of a change of spin in free flight, beside one elsewhere."""
+    flight_m_s: float = 0.15
+    """A change of velocity, beyond gravity's, below this is free flight."""
+    roll: RollConfig = field(default_factory=RollConfig)
 
 
 @dataclass(frozen=True, eq=False)
 class Pace:
-    """Between views: turn about the axis so far (v-1) and seconds; of views: whether it stands for frames without
-    motion, whether it flies, and the price of a change of spin there."""
+    """Between views: turn about the axis so far (v-1) and seconds, and what rolling on the table makes it; of views:
+    whether it stands for frames without motion, whether it flies, and the price of a change of spin there."""
 
     base_rad: Float[Array, " r"]
     steps_s: Float[Array, " r"]
     still: Bool[Array, " v"]
     flies: Bool[Array, " v"]
     price: Float[Array, " v"]
+    rolled: Rolled
+
+
+def pace_of(
+    scene: Scene, poses: Float[Array, "n 4 4"], runs: list[list[int]], views: Int[Array, " v"], body: Grounded,
+    config: SteadyConfig,
+) -> Pace:  # fmt: skip
+    """How the body turns about its axis from view to view, and where it flies freely or rolls; `runs`: the frames that
+    each view stands for."""
+    t, axis = scene.times_s, body.axis
+    # what stands still turns between its last frame and the next one's first
+    steps_s = np.array([t[b[0]] - t[a[-1]] for a, b in zip(runs, runs[1:])])
+    base = np.array([float(rotation_log(poses[b][:3, :3].T @ poses[a][:3, :3]) @ axis.direction)
+                     for a, b in zip(views, views[1:])])  # fmt: skip
+    still = np.array([len(run) > 1 for run in runs])
+    flies = np.zeros(len(runs), dtype=bool)
+    middle = axis.point_m + axis.direction * float(axis.direction @ scene.center_m)
+    for n in range(1, len(runs) - 1):
+        x = [poses[i][:3, :3] @ middle + poses[i][:3, 3] for i in views[n - 1 : n + 2]]
+        change = (x[2] - x[1]) / steps_s[n] - (x[1] - x[0]) / steps_s[n - 1]
+        change = change - 0.5 * (steps_s[n] + steps_s[n - 1]) * scene.gravity_camera_m_s2
+        flies[n] = not still[n] and np.linalg.norm(change) < config.flight_m_s
+    price = np.where(flies, config.flight_price, 1.0)
+    return Pace(base, steps_s, still, flies, price, rolled(body, steps_s, config.roll))
 
 
 def steadied(
@@ -67,6 +101,7 @@ def steadied(
             weight = pace.price[view] / (1 + (change / (2 * usual)) ** 2) / usual**2
             g += weight * change * slope
             H += weight * np.outer(slope, slope)
+        _roll(H, g, angle, pace)
         g[first], H[first], H[:, first] = 0.0, 0.0, 0.0
         H[first, first] = 1e9
         step = -np.linalg.solve(H + 1e-7 * np.diag(np.diag(H)) + 1e-6 * np.eye(len(H)), g)
@@ -98,6 +133,17 @@ def _of_pairs(
     for a, b, sign in ((i, i, 1), (j, j, 1), (i, j, -1), (j, i, -1)):
         np.add.at(H, (a, b), sign * stiff)
     return H, g
+
+
+def _roll(H: Float[Array, "v v"], g: Float[Array, " v"], angle: Float[Array, " v"], pace: Pace) -> None:
+    """Adds to the normal equations that the turns from view to view are those that rolling makes."""
+    off = pace.base_rad - np.diff(angle) - pace.rolled.turn_rad
+    weight = 1 / (pace.rolled.sigma_rad**2 + (off / 2) ** 2)
+    before = np.arange(len(off))
+    np.add.at(g, before, weight * off)
+    np.add.at(g, before + 1, -weight * off)
+    for a, b, sign in ((0, 0, 1), (1, 1, 1), (0, 1, -1), (1, 0, -1)):
+        np.add.at(H, (before + a, before + b), sign * weight)
 
 
 def _changes(angle: Float[Array, " v"], pace: Pace) -> Terms:

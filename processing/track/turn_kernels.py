@@ -97,9 +97,10 @@ def differences(looks, count, pairs, state, every, width, out):
 
 @no_type_check
 @njit(cache=True, nogil=True, fastmath=True)
-def spin_cost(state, base, steps_s, still, price, step, motion):
+def spin_cost(state, base, steps_s, still, price, rolled, slip, step, motion):
     """Price of the changes of spin. base (v-1): turn about the axis from view to view at state 0 (rad); still (v):
-    whether a view stands for frames without motion; price (v); motion: usual change, fast spin, price of faster."""
+    whether a view stands for frames without motion; price (v); rolled, slip (v-1): turn that rolling on the table makes
+    and its standard deviation (infinite where it does not roll); motion: usual change, fast spin, price of faster."""
     usual, fast, dear = motion[0], motion[1], motion[2]
     total, last, known = 0.0, 0.0, False
     n = len(steps_s)
@@ -112,6 +113,9 @@ def spin_cost(state, base, steps_s, still, price, step, motion):
             break
         turn = base[t] - (state[t + 1] - state[t]) * step
         turn -= 2.0 * np.pi * np.floor(turn / (2.0 * np.pi) + 0.5)
+        off = turn - rolled[t]
+        off -= 2.0 * np.pi * np.floor(off / (2.0 * np.pi) + 0.5)
+        total += np.log(1.0 + (off / slip[t]) ** 2)
         rate = turn / steps_s[t]
         if known:
             total += price[t] * np.log(1.0 + ((rate - last) / usual) ** 2)
@@ -122,9 +126,9 @@ def spin_cost(state, base, steps_s, still, price, step, motion):
 
 @no_type_check
 @njit(cache=True, nogil=True, fastmath=True)
-def energy(state, costs, pairs, base, steps_s, still, price, step, motion):
+def energy(state, costs, pairs, base, steps_s, still, price, rolled, slip, step, motion):
     """What the pairs (costs (m, cells), cyclic) and the changes of spin cost together."""
-    total = spin_cost(state, base, steps_s, still, price, step, motion)
+    total = spin_cost(state, base, steps_s, still, price, rolled, slip, step, motion)
     for m in range(pairs.shape[0]):
         total += costs[m, (state[pairs[m, 0]] - state[pairs[m, 1]]) % costs.shape[1]]
     return total
@@ -158,7 +162,7 @@ def _ramp(state, a, length, q, cells, trial):
 
 @no_type_check
 @njit(cache=True, nogil=True, fastmath=True)
-def settle(state, costs, pairs, base, steps_s, still, price, step, motion, sweeps, longest):
+def settle(state, costs, pairs, base, steps_s, still, price, rolled, slip, step, motion, sweeps, longest):
     """Turns runs of views, ends of the toss, and ends reached by a ramp, until none wants to turn; view 0 stays."""
     v, cells = len(state), costs.shape[1]
     out, trial = np.zeros(cells), state.copy()
@@ -174,7 +178,7 @@ def settle(state, costs, pairs, base, steps_s, still, price, step, motion, sweep
                 for q in range(cells):
                     trial[:] = state
                     trial[a : b + 1] = (state[a : b + 1] + q) % cells
-                    e = out[q] + spin_cost(trial, base, steps_s, still, price, step, motion)
+                    e = out[q] + spin_cost(trial, base, steps_s, still, price, rolled, slip, step, motion)
                     if q == 0 or e < least - 1e-9:
                         best, least = q, e
                 if best:
@@ -185,7 +189,7 @@ def settle(state, costs, pairs, base, steps_s, still, price, step, motion, sweep
                 best, least = 0, 0.0
                 for q in range(cells):
                     _ramp(state, a, length, q, cells, trial)
-                    e = energy(trial, costs, pairs, base, steps_s, still, price, step, motion)
+                    e = energy(trial, costs, pairs, base, steps_s, still, price, rolled, slip, step, motion)
                     if q == 0 or e < least - 1e-6:
                         best, least = q, e
                 if best:
@@ -199,7 +203,7 @@ def settle(state, costs, pairs, base, steps_s, still, price, step, motion, sweep
 
 @no_type_check
 @njit(cache=True, nogil=True, fastmath=True)
-def greedy(v, costs, pairs, base, steps_s, still, price, step, motion):
+def greedy(v, costs, pairs, base, steps_s, still, price, rolled, slip, step, motion):
     """Each view where those before want it."""
     cells = costs.shape[1]
     state, e = np.zeros(v, np.int64), np.zeros(cells)
@@ -213,7 +217,17 @@ def greedy(v, costs, pairs, base, steps_s, still, price, step, motion):
         best = 0
         for q in range(cells):
             state[t] = q
-            e[q] += spin_cost(state[: t + 1], base[:t], steps_s[:t], still[: t + 1], price[: t + 1], step, motion)
+            e[q] += spin_cost(
+                state[: t + 1],
+                base[:t],
+                steps_s[:t],
+                still[: t + 1],
+                price[: t + 1],
+                rolled[:t],
+                slip[:t],
+                step,
+                motion,
+            )
             if e[q] < e[best]:
                 best = q
         state[t] = best
@@ -222,7 +236,7 @@ def greedy(v, costs, pairs, base, steps_s, still, price, step, motion):
 
 @no_type_check
 @njit(cache=True, nogil=True, fastmath=True)
-def spreads(state, costs, pairs, base, steps_s, still, price, step, motion):
+def spreads(state, costs, pairs, base, steps_s, still, price, rolled, slip, step, motion):
     """Variance (rad^2) of each view's turn against view 0: the widest of the moves that turn it, each with the
     probability that its energy leaves it."""
     v, cells = len(state), costs.shape[1]
@@ -236,13 +250,13 @@ def spreads(state, costs, pairs, base, steps_s, still, price, step, motion):
             for q in range(cells):
                 trial[:] = state
                 trial[a : b + 1] = (state[a : b + 1] + q) % cells
-                e[q] = out[q] + spin_cost(trial, base, steps_s, still, price, step, motion)
+                e[q] = out[q] + spin_cost(trial, base, steps_s, still, price, rolled, slip, step, motion)
             _widen(var, e, a, b, 1, step)
     for length in RAMPS:
         for a in range(1, v - 1):
             for q in range(cells):
                 _ramp(state, a, length, q, cells, trial)
-                e[q] = energy(trial, costs, pairs, base, steps_s, still, price, step, motion)
+                e[q] = energy(trial, costs, pairs, base, steps_s, still, price, rolled, slip, step, motion)
             _widen(var, e, a, v - 1, length, step)
     return var
 

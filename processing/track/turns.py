@@ -21,10 +21,10 @@ from processing.track import kernels as k
 from processing.track import turn_kernels as tk
 from processing.track.beam import Scene
 from processing.track.charts import ChartConfig, Charts, charts_of
+from processing.track.rolling import Grounded, grounded, sunk
 from processing.track.round_axis import Axis, AxisConfig
-from processing.track.steady_turns import Normal, Pace, SteadyConfig, steadied
+from processing.track.steady_turns import Normal, SteadyConfig, pace_of, steadied
 from processing.track.views import ViewStore
-from recordings.geometry import rotation_log
 
 NOT_COMPARED = 1e6
 """Standard deviation of what does not count."""
@@ -80,10 +80,6 @@ class TurnConfig:
     """Looks that count less than this make the search start again."""
     spin_change_rad_s: float = 1.5
     """Usual change of spin from view to view, on the grid."""
-    flight_price: float = 4.0
-    """Of a change of spin in free flight, beside one elsewhere."""
-    flight_m_s: float = 0.15
-    """A change of velocity, beyond gravity's, below this is free flight."""
     fast_rad_s: float = 25.0
     fast_price: float = 100.0
     """Spins above this cost their excess times this."""
@@ -134,7 +130,8 @@ def contradiction(
     if len(frames.pairs) == 0:
         return 0.0
     charts = charts_of(scene, poses, frames.views, found.axis, config.fine_cells, config.chart)
-    costs, _ = _fine_costs(charts, frames, found.trust, config)
+    body = grounded(scene.store, frames.views, poses[frames.views], found.axis, charts.rings)
+    costs, _ = _fine_costs(charts, body, frames, found.trust, config)
     return float(costs[:, config.fine_reach].mean())
 
 
@@ -181,14 +178,23 @@ def _weighed(
 ) -> tuple[Float[Array, "m c"], Float[Array, "m c"], tuple[object, ...]]:
     """What each pair says against all turns of its two views, by looks and by shape, and what else the search needs."""
     charts = charts_of(scene, poses, frames.views, axis, config.cells, config.chart)
-    pace = _pace(scene, poses, frames, axis, config)
+    body = grounded(scene.store, frames.views, poses[frames.views], axis, charts.rings)
+    pace = pace_of(scene, poses, frames.runs, frames.views, body, config.steady)
     looks, shape = _said(charts, frames.pairs, config.cells // 2, None, config)
     looks, shape = (_cyclic(c, config.cells) for c in (looks, -shape))
     looks = np.minimum(np.maximum(_above_least(looks) - config.pair_dead, 0.0), config.most_looks)
-    shape = np.minimum(_above_least(shape), config.most_shape)
-    motion = np.array([config.spin_change_rad_s, config.fast_rad_s, config.fast_price])
     step = 2 * np.pi / config.cells
-    return looks, shape, (frames.pairs, pace.base_rad, pace.steps_s, pace.still, pace.price, step, motion)
+    shape = np.minimum(_above_least(shape), config.most_shape)
+    shape += _sunk(body, charts, frames, step * np.arange(config.cells), config)
+    motion = np.array([config.spin_change_rad_s, config.fast_rad_s, config.fast_price])
+    rolls = pace.rolled.turn_rad, pace.rolled.sigma_rad
+    return looks, shape, (frames.pairs, pace.base_rad, pace.steps_s, pace.still, pace.price, *rolls, step, motion)
+
+
+def _sunk(
+    body: Grounded, charts: Charts, frames: _Frames, turns_rad: Float[Array, " d"], config: TurnConfig
+) -> Float[Array, "m d"]:
+    return np.minimum(sunk(body, charts.standing, frames.pairs, turns_rad, config.steady.roll), config.most_shape)
 
 
 def _spread(
@@ -235,9 +241,10 @@ def steady(scene: Scene, found: Turned, use: Bool[Array, " n"], first: int, conf
         return found
     for _ in range(config.rounds):
         charts = charts_of(scene, poses, frames.views, found.axis, config.fine_cells, config.chart)
-        costs, cell_rad = _fine_costs(charts, frames, found.trust, config)
+        body = grounded(scene.store, frames.views, poses[frames.views], found.axis, charts.rings)
+        costs, cell_rad = _fine_costs(charts, body, frames, found.trust, config)
         standing = turns_of_standing(scene.store, poses[frames.views], frames, charts.standing, found.axis, config)
-        pace = _pace(scene, poses, frames, found.axis, config)
+        pace = pace_of(scene, poses, frames.runs, frames.views, body, config.steady)
         start = _run_of(frames.runs, first)
         angle, sigma = steadied(costs, frames.pairs, standing, pace, cell_rad, start, config.steady)
         poses = _moved(poses, frames, angle, found.axis, first)
@@ -284,14 +291,18 @@ def turns_of_standing(
     return H, g
 
 
-def _fine_costs(charts: Charts, frames: _Frames, trust: float, config: TurnConfig) -> tuple[Float[Array, "m d"], float]:
+def _fine_costs(
+    charts: Charts, body: Grounded, frames: _Frames, trust: float, config: TurnConfig
+) -> tuple[Float[Array, "m d"], float]:
     """What each pair says against turns near those of the poses, in fine cells, and a cell's angle."""
     here = np.zeros(len(frames.views), dtype=np.int64)
     share = config.cells / config.fine_cells  # more cells, as many witnesses
     looks, shape = _said(charts, frames.pairs, config.fine_reach, here, config)
     looks, shape = _above_least(share * looks), _above_least(-share * shape)
     looks = np.minimum(np.maximum(looks - config.fine_dead, 0.0), config.most_looks)
-    return trust * looks + np.minimum(shape, config.most_shape), 2 * np.pi / config.fine_cells
+    shape, cell_rad = np.minimum(shape, config.most_shape), 2 * np.pi / config.fine_cells
+    turns_rad = cell_rad * np.arange(-config.fine_reach, config.fine_reach + 1)
+    return trust * looks + shape + _sunk(body, charts, frames, turns_rad, config), cell_rad
 
 
 def _said(
@@ -365,24 +376,6 @@ def _frames(scene: Scene, use: Bool[Array, " n"], config: TurnConfig) -> _Frames
 
 def _run_of(runs: list[list[int]], frame: int) -> int:
     return next((n for n, run in enumerate(runs) if frame in run), 0)
-
-
-def _pace(scene: Scene, poses: Float[Array, "n 4 4"], frames: _Frames, axis: Axis, config: TurnConfig) -> Pace:
-    """How the body turns about its axis from view to view, and where it flies freely."""
-    runs, views, t = frames.runs, frames.views, scene.times_s
-    # what stands still turns between its last frame and the next one's first
-    steps_s = np.array([t[b[0]] - t[a[-1]] for a, b in zip(runs, runs[1:])])
-    base = np.array([float(rotation_log(poses[b][:3, :3].T @ poses[a][:3, :3]) @ axis.direction)
-                     for a, b in zip(views, views[1:])])  # fmt: skip
-    still = np.array([len(run) > 1 for run in runs])
-    flies = np.zeros(len(runs), dtype=bool)
-    middle = axis.point_m + axis.direction * float(axis.direction @ scene.center_m)
-    for n in range(1, len(runs) - 1):
-        x = [poses[i][:3, :3] @ middle + poses[i][:3, 3] for i in views[n - 1 : n + 2]]
-        change = (x[2] - x[1]) / steps_s[n] - (x[1] - x[0]) / steps_s[n - 1]
-        change = change - 0.5 * (steps_s[n] + steps_s[n - 1]) * scene.gravity_camera_m_s2
-        flies[n] = not still[n] and np.linalg.norm(change) < config.flight_m_s
-    return Pace(base, steps_s, still, flies, np.where(flies, config.flight_price, 1.0))
 
 
 def _angles(poses: Float[Array, "v 4 4"], others: Float[Array, "v 4 4"], axis: Axis) -> Float[Array, " v"]:

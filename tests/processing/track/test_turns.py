@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -11,6 +13,7 @@ from processing.track.beam import Scene
 from processing.track.charts import ChartConfig, Charts, _heights, _off, _Pixels, _shines
 from processing.track.features import Sift
 from processing.track.optics import Optics
+from processing.track.rolling import Rolled
 from processing.track.round_axis import Axis, AxisConfig, open_axis
 from processing.track.steady_turns import Pace, SteadyConfig, steadied
 from processing.track.turns import TurnConfig, Turned, _believed, _Frames, _usual, doubted, turns_of_standing
@@ -81,14 +84,14 @@ def test_a_box_has_no_open_turn() -> None:
 def pace(views: int, flies: bool = False) -> Pace:
     nothing = np.zeros(views - 1)
     no = np.zeros(views, dtype=bool)
-    return Pace(nothing, np.full(views - 1, 1 / 30), no, no | flies, np.ones(views))
+    return Pace(nothing, np.full(views - 1, 1 / 30), no, no | flies, np.ones(views), Rolled(nothing, nothing + np.inf))
 
 
 def given(costs: np.ndarray, pairs: np.ndarray, views: int) -> tuple[object, ...]:
     p = pace(views)
-    return (
-        costs, pairs, p.base_rad, p.steps_s, p.still, p.price, 2 * np.pi / costs.shape[1], np.array([1.5, 25.0, 20.0])
-    )  # fmt: skip
+    rolls = p.rolled.turn_rad, p.rolled.sigma_rad
+    step, motion = 2 * np.pi / costs.shape[1], np.array([1.5, 25.0, 20.0])
+    return costs, pairs, p.base_rad, p.steps_s, p.still, p.price, *rolls, step, motion
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
@@ -121,7 +124,7 @@ def test_a_stretch_that_shows_nothing_turns_as_steadily_as_what_is_seen_around_i
     costs = np.minimum(np.abs(offsets) / cell, 6.0)
     start = np.where(seen, 0.0, 0.3)
     p = pace(views, flies=True)
-    moved = Pace(-np.diff(start), p.steps_s, p.still, p.flies, p.price)
+    moved = replace(p, base_rad=-np.diff(start))
     shift = start[pairs[:, 0]] - start[pairs[:, 1]]
     assert (shift == 0).all()
     nothing = np.zeros((views, views)), np.zeros(views)
@@ -133,6 +136,21 @@ def test_a_stretch_that_shows_nothing_turns_as_steadily_as_what_is_seen_around_i
     np.testing.assert_allclose(sigma, SteadyConfig().tails * once)
 
 
+def test_a_stretch_that_shows_nothing_turns_as_the_body_rolls() -> None:
+    views, reach, cell = 20, 40, np.radians(1.5)
+    truth = np.cumsum(np.r_[0.0, 0.02 * np.arange(views - 1) * (np.arange(views - 1) < 12)])  # faster, then it stops
+    pairs = np.array([(a, b) for a in range(6) for b in range(a)])
+    offsets = np.arange(-reach, reach + 1)[None] * cell - (truth[pairs[:, 0]] - truth[pairs[:, 1]])[:, None]
+    costs = np.minimum(np.abs(offsets) / cell, 6.0)
+    rolling = replace(pace(views), rolled=Rolled(-np.diff(truth), np.full(views - 1, 0.02)))
+    nothing = np.zeros((views, views)), np.zeros(views)
+    blind, doubt = steadied(costs, pairs, nothing, pace(views), cell, 0, SteadyConfig())
+    angle, sigma = steadied(costs, pairs, nothing, rolling, cell, 0, SteadyConfig())
+    assert np.abs(blind - truth).max() > np.radians(10)
+    np.testing.assert_allclose(angle, truth, atol=np.radians(4))
+    assert sigma[-1] < 0.2 * doubt[-1]
+
+
 def test_looks_of_one_colour_say_nothing_and_a_label_says_where_it_is() -> None:
     rng = np.random.default_rng(0)
     looks = rng.normal(0, 0.02, (2, 4, 60, 2))
@@ -142,7 +160,9 @@ def test_looks_of_one_colour_say_nothing_and_a_label_says_where_it_is() -> None:
     sigma = np.full(2, 0.05)
 
     def said() -> np.ndarray:
-        charts = Charts(looks, count, np.zeros((2, 1, 60)), np.zeros((2, 3, 1, 60)), np.zeros((2, 1, 60)), [])
+        charts = Charts(
+            looks, count, np.zeros((2, 1, 60)), np.zeros((2, 3, 1, 60)), np.zeros((2, 1, 60)), [], np.zeros((0, 2))
+        )
         out[:] = 0
         tk.said_by_looks(looks, count, _usual(charts, sigma), pairs, sigma, 0.1, 0.5, 30, out)
         return out[0]
