@@ -97,19 +97,19 @@ def differences(looks, count, pairs, state, every, width, out):
 
 @no_type_check
 @njit(cache=True, nogil=True, fastmath=True)
-def spin_cost(state, base, steps_s, still, price, rolled, slip, step, motion):
-    """Price of the changes of spin. base (v-1): turn about the axis from view to view at state 0 (rad); still (v):
-    whether a view stands for frames without motion; price (v); rolled, slip (v-1): turn that rolling on the table makes
-    and its standard deviation (infinite where it does not roll); motion: usual change, fast spin, price of faster."""
+def spin_cost(state, base, steps_s, still, price, rolled, slip, step, motion, a, b):
+    """Price of the changes of spin within the views a..b. base (v-1): turn about the axis from view to view at state 0
+    (rad); still (v): whether a view stands for frames without motion; price (v); rolled, slip (v-1): turn that rolling
+    on the table makes and its standard deviation (infinite where it does not roll); motion: usual change, fast spin,
+    price of faster."""
     usual, fast, dear = motion[0], motion[1], motion[2]
     total, last, known = 0.0, 0.0, False
-    n = len(steps_s)
-    for t in range(n + 1):
+    for t in range(a, b + 1):
         if still[t]:
             if known:
                 total += price[t] * np.log(1.0 + (last / usual) ** 2)
             last, known = 0.0, True
-        if t == n:
+        if t == b:
             break
         turn = base[t] - (state[t + 1] - state[t]) * step
         turn -= 2.0 * np.pi * np.floor(turn / (2.0 * np.pi) + 0.5)
@@ -128,7 +128,7 @@ def spin_cost(state, base, steps_s, still, price, rolled, slip, step, motion):
 @njit(cache=True, nogil=True, fastmath=True)
 def energy(state, costs, pairs, base, steps_s, still, price, rolled, slip, step, motion):
     """What the pairs (costs (m, cells), cyclic) and the changes of spin cost together."""
-    total = spin_cost(state, base, steps_s, still, price, rolled, slip, step, motion)
+    total = spin_cost(state, base, steps_s, still, price, rolled, slip, step, motion, 0, len(state) - 1)
     for m in range(pairs.shape[0]):
         total += costs[m, (state[pairs[m, 0]] - state[pairs[m, 1]]) % costs.shape[1]]
     return total
@@ -152,12 +152,34 @@ def _part(state, a, b, costs, pairs, out):
 
 @no_type_check
 @njit(cache=True, nogil=True, fastmath=True)
-def _ramp(state, a, length, q, cells, trial):
-    """`trial`: the views from a on turned, over `length` of them more and more, by q."""
+def _ramp(state, a, length, q, cells, trial, b):
+    """`trial`: the views from a on turned, over `length` of them more and more, by q; views up to b."""
     turn = q if q <= cells // 2 else q - cells
-    for t in range(len(state)):
-        share = min(max((t - a + 1.0) / length, 0.0), 1.0)
-        trial[t] = (state[t] + int(np.round(turn * share))) % cells
+    for t in range(a, b + 1):
+        trial[t] = (state[t] + int(np.round(turn * min((t - a + 1.0) / length, 1.0)))) % cells
+
+
+@no_type_check
+@njit(cache=True, nogil=True, fastmath=True)
+def _ramp_costs(state, a, length, costs, pairs, rest, out, trial):
+    """Into out (cells): what the pairs and the changes of spin that a ramp changes cost, by how far it turns."""
+    base, steps_s, still, price, rolled, slip, step, motion = rest
+    v, cells = len(state), costs.shape[1]
+    out[:] = 0.0
+    for m in range(pairs.shape[0]):
+        i, j = pairs[m, 0], pairs[m, 1]
+        one, two = min(max((i - a + 1.0) / length, 0.0), 1.0), min(max((j - a + 1.0) / length, 0.0), 1.0)
+        if one == two:
+            continue
+        between = state[i] - state[j]
+        for q in range(cells):
+            turn = q if q <= cells // 2 else q - cells
+            out[q] += costs[m, (between + int(np.round(turn * one)) - int(np.round(turn * two))) % cells]
+    lo, hi = max(a - 2, 0), min(a + length + 1, v - 1)
+    trial[lo : hi + 1] = state[lo : hi + 1]
+    for q in range(cells):
+        _ramp(state, a, length, q, cells, trial, hi)
+        out[q] += spin_cost(trial, base, steps_s, still, price, rolled, slip, step, motion, lo, hi)
 
 
 @no_type_check
@@ -166,6 +188,7 @@ def settle(state, costs, pairs, base, steps_s, still, price, rolled, slip, step,
     """Turns runs of views, ends of the toss, and ends reached by a ramp, until none wants to turn; view 0 stays."""
     v, cells = len(state), costs.shape[1]
     out, trial = np.zeros(cells), state.copy()
+    rest = base, steps_s, still, price, rolled, slip, step, motion
     for _ in range(sweeps):
         changed = False
         for length in range(longest):
@@ -174,11 +197,12 @@ def settle(state, costs, pairs, base, steps_s, still, price, rolled, slip, step,
                 if b >= v or (length > 0 and b == v - 1) or (length > 4 and length % 4 > 0):
                     continue
                 _part(state, a, b, costs, pairs, out)
+                lo, hi = max(a - 2, 0), min(a + 2 if length == 0 else b + 2, v - 1)
+                trial[lo : hi + 1] = state[lo : hi + 1]
                 best, least = 0, 0.0
                 for q in range(cells):
-                    trial[:] = state
-                    trial[a : b + 1] = (state[a : b + 1] + q) % cells
-                    e = out[q] + spin_cost(trial, base, steps_s, still, price, rolled, slip, step, motion)
+                    trial[a : min(b, hi) + 1] = (state[a : min(b, hi) + 1] + q) % cells
+                    e = out[q] + spin_cost(trial, base, steps_s, still, price, rolled, slip, step, motion, lo, hi)
                     if q == 0 or e < least - 1e-9:
                         best, least = q, e
                 if best:
@@ -186,14 +210,11 @@ def settle(state, costs, pairs, base, steps_s, still, price, rolled, slip, step,
                     changed = True
         for length in RAMPS:
             for a in range(1, v - 1):
-                best, least = 0, 0.0
-                for q in range(cells):
-                    _ramp(state, a, length, q, cells, trial)
-                    e = energy(trial, costs, pairs, base, steps_s, still, price, rolled, slip, step, motion)
-                    if q == 0 or e < least - 1e-6:
-                        best, least = q, e
-                if best:
-                    _ramp(state, a, length, best, cells, trial)
+                _ramp_costs(state, a, length, costs, pairs, rest, out, trial)
+                best = out.argmin()
+                if out[best] < out[0] - 1e-6:
+                    trial[:] = state
+                    _ramp(state, a, length, best, cells, trial, v - 1)
                     state[:] = trial
                     changed = True
         if not changed:
@@ -217,17 +238,8 @@ def greedy(v, costs, pairs, base, steps_s, still, price, rolled, slip, step, mot
         best = 0
         for q in range(cells):
             state[t] = q
-            e[q] += spin_cost(
-                state[: t + 1],
-                base[:t],
-                steps_s[:t],
-                still[: t + 1],
-                price[: t + 1],
-                rolled[:t],
-                slip[:t],
-                step,
-                motion,
-            )
+            lo = max(t - 2, 0)
+            e[q] += spin_cost(state, base, steps_s, still, price, rolled, slip, step, motion, lo, t)
             if e[q] < e[best]:
                 best = q
         state[t] = best
@@ -241,22 +253,22 @@ def spreads(state, costs, pairs, base, steps_s, still, price, rolled, slip, step
     probability that its energy leaves it."""
     v, cells = len(state), costs.shape[1]
     out, trial, e, var = np.zeros(cells), state.copy(), np.zeros(cells), np.zeros(v)
+    rest = base, steps_s, still, price, rolled, slip, step, motion
     for length in range(v):
         for a in range(1, v):
             b = v - 1 if length == 0 else a + length - 1
             if b >= v:
                 continue
             _part(state, a, b, costs, pairs, out)
+            lo, hi = max(a - 2, 0), min(a + 2 if length == 0 else b + 2, v - 1)
+            trial[lo : hi + 1] = state[lo : hi + 1]
             for q in range(cells):
-                trial[:] = state
-                trial[a : b + 1] = (state[a : b + 1] + q) % cells
-                e[q] = out[q] + spin_cost(trial, base, steps_s, still, price, rolled, slip, step, motion)
+                trial[a : min(b, hi) + 1] = (state[a : min(b, hi) + 1] + q) % cells
+                e[q] = out[q] + spin_cost(trial, base, steps_s, still, price, rolled, slip, step, motion, lo, hi)
             _widen(var, e, a, b, 1, step)
     for length in RAMPS:
         for a in range(1, v - 1):
-            for q in range(cells):
-                _ramp(state, a, length, q, cells, trial)
-                e[q] = energy(trial, costs, pairs, base, steps_s, still, price, rolled, slip, step, motion)
+            _ramp_costs(state, a, length, costs, pairs, rest, e, trial)
             _widen(var, e, a, v - 1, length, step)
     return var
 
