@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 from numpy import ndarray as Array
+from scipy.ndimage import minimum_filter1d
 
 from processing.track import kernels as k
 from processing.track import turn_kernels as tk
@@ -41,6 +42,8 @@ class TurnConfig:
     fine_cells: int = 240
     fine_reach: int = 20
     """Cells of the circle on the grid and off it, and how many of the latter a pair is compared over."""
+    slack: int = 4
+    """Fine cells that a pair's shape leaves open: a handle is thick, and no view sees both of its sides."""
     near: tuple[int, ...] = (1, 2, 3, 4, 6)
     """Steps in time over which views are always compared ..."""
     pairs: int = 12
@@ -300,7 +303,8 @@ def _fine_costs(
     looks, shape = _said(charts, frames.pairs, config.fine_reach, here, config)
     looks, shape = _above_least(share * looks), _above_least(-share * shape)
     looks = np.minimum(np.maximum(looks - config.fine_dead, 0.0), config.most_looks)
-    shape, cell_rad = np.minimum(shape, config.most_shape), 2 * np.pi / config.fine_cells
+    shape = minimum_filter1d(np.minimum(shape, config.most_shape), 2 * config.slack + 1, axis=1, mode="nearest")
+    cell_rad = 2 * np.pi / config.fine_cells
     turns_rad = cell_rad * np.arange(-config.fine_reach, config.fine_reach + 1)
     return trust * looks + shape + _sunk(body, charts, frames, turns_rad, config), cell_rad
 
