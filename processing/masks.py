@@ -25,7 +25,7 @@ from processing.segment.static_scene import StaticScene, calibrated_table_depth,
 from processing.stage import Counts, Done
 from recordings.errors import BadInput
 from recordings.records import RgbdFrame
-from recordings.results import write_masks
+from recordings.results import write_hand, write_masks
 from recordings.session import RgbdFrames
 
 if TYPE_CHECKING:
@@ -104,6 +104,7 @@ def object_masks(run: Run, toss: int, scene: Done) -> Done:
         write_masks(folder, toss, [m.mask for m in found], np.array([m.confidence for m in found]))
         if drawn is not None:
             drawn.write(folder / f"{name}.robot")
+            write_hand(folder, toss, drawn.hand(frames.times_ns))
         empty = sum(not m.mask.any() for m in found)
         least = run.config.track.view.least_samples
         tracked = (m for m in found if m.mask.sum() >= least)
@@ -122,7 +123,7 @@ def object_masks(run: Run, toss: int, scene: Done) -> Done:
 
     named = settings_of(run.config.backends.segmenter, run.config.backends)
     config = {"given_masks": choice, "background": asdict(run.config.masks), **named}
-    return run.store.run("segment", 5, config, inputs, compute)
+    return run.store.run("segment", 6, config, inputs, compute)
 
 
 def _given(run: Run, toss: int) -> dict[int, Bool[Array, "h w"]]:

@@ -20,7 +20,16 @@ from processing.track.register import register_tosses
 from processing.track.sequence import track_toss
 from processing.vision import CAMERA
 from recordings.geometry import Transform
-from recordings.results import RobotMasks, read_masks, read_shape, read_track, write_masks, write_shape, write_track
+from recordings.results import (
+    RobotMasks,
+    read_hand,
+    read_masks,
+    read_shape,
+    read_track,
+    write_masks,
+    write_shape,
+    write_track,
+)
 from recordings.tracks import ObjectShape, ObjectTrack
 
 if TYPE_CHECKING:
@@ -150,7 +159,7 @@ def second_tracks(run: Run, name: str, drawn: Done, shape: Done, masks: Mapping[
         return {"fit": [round(float(f), 4) for f in together.fit]}
 
     config = {"register": run.matcher_settings(run.config.register), "together": True}
-    return {**tracks, **dict.fromkeys(seen, run.store.run("register", 2, config, inputs, compute))}
+    return {**tracks, **dict.fromkeys(seen, run.store.run("register", 3, config, inputs, compute))}
 
 
 def _second_track(run: Run, toss: int, drawn: Done, shape: Done, masks: Done) -> Done:
@@ -182,6 +191,7 @@ def _second_track(run: Run, toss: int, drawn: Done, shape: Done, masks: Done) ->
             world_from_camera=run.session.calibration.find("world", CAMERA),
             matcher=run.matcher,
             colorless=frames.colorless,
+            hand=read_hand(masks.folder, toss),
             **given,
         )
         write_toss_track(folder, tracked)

@@ -14,7 +14,7 @@ from processing.track.multi_hypothesis import read_toss_track, write_toss_track
 from processing.track.notes import notes_of
 from processing.track.register import register_tosses
 from processing.track.sequence import track_toss
-from recordings.results import RobotMasks, read_masks, read_shape, read_track, write_shape, write_track
+from recordings.results import RobotMasks, read_hand, read_masks, read_shape, read_track, write_shape, write_track
 from recordings.session_writer import file_sha256
 from recordings.track_notes import write_notes
 from recordings.tracks import ObjectTrack
@@ -49,6 +49,7 @@ def track_stage(run: Run, toss: int, masks: Done) -> Done:
             matcher=run.matcher,
             start=None if start is None else start.camera_from_object,
             start_frame=None if start is None else start.frame,
+            hand=read_hand(masks.folder, toss),
         )
         write_toss_track(folder, tracked)
         write_notes(folder, toss, *notes_of(tracked, run.matcher))
@@ -88,6 +89,7 @@ def model_track_stage(run: Run, toss: int, masks: Done, model: Done) -> Done:
             world_from_camera=run.session.calibration.find("world", CAMERA),
             matcher=run.matcher,
             model=shape,
+            hand=read_hand(masks.folder, toss),
         )
         write_toss_track(folder, tracked)
         write_notes(folder, toss, *notes_of(tracked, run.matcher))
@@ -126,7 +128,7 @@ def register_stage(run: Run, tracks: dict[int, Done], masks: dict[int, Done]) ->
             write_track(folder, replace(kept, object_frame="object"))
         return {**counts, "fit": [round(float(f), 4) if np.isfinite(f) else None for f in together.fit]}
 
-    return run.store.run("register", 3, run.matcher_settings(run.config.register), inputs, compute)
+    return run.store.run("register", 4, run.matcher_settings(run.config.register), inputs, compute)
 
 
 def field_stage(run: Run, name: str, tracks: dict[int, Done], masks: dict[int, Done]) -> Done:

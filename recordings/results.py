@@ -113,6 +113,19 @@ def write_masks(folder: Path, toss: int, masks: Sequence[Bool[Array, "h w"]], co
     return out
 
 
+def write_hand(folder: Path, toss: int, camera_from_hand: Float[Array, "n 4 4"]) -> Path:
+    """Write the robot's hand in every colour frame of a toss; NaN where it is not known, or may hold nothing."""
+    path = folder / f"{_stem(toss)}.hand.npy"
+    np.save(path, camera_from_hand, allow_pickle=False)
+    return path
+
+
+def read_hand(folder: Path, toss: int) -> Float[Array, "n 4 4"] | None:
+    """What `write_hand` wrote; None where no robot is known."""
+    path = folder / f"{_stem(toss)}.hand.npy"
+    return np.load(path, allow_pickle=False) if path.exists() else None
+
+
 class Masks(Sequence[Bool[Array, "h w"]]):
     """The masks of one toss, decoded when asked for. `confidence` is 0..1 per frame."""
 

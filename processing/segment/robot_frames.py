@@ -14,7 +14,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Float32, UInt8
+from jaxtyping import Bool, Float, Float32, Int, UInt8
 from numpy import ndarray as Array
 
 from processing.segment.foreground import grown, kernel
@@ -23,7 +23,7 @@ from processing.segment.robot_view import RobotView
 from processing.segment.static_scene import StaticScene, stereo_sigma_m
 from recordings.geometry import Transform
 from recordings.records import RgbdFrame
-from recordings.robot import ArmPath
+from recordings.robot import PANDA_TOOL, ArmPath
 
 FINGERS = ("panda_leftfinger", "panda_rightfinger")
 SAME_TIME_NS = 500_000
@@ -115,6 +115,15 @@ class RobotFrames(Sequence[Bool[Array, "h w"]]):
         """The same robot for frames of which only every stride-th pixel of rows and columns is looked at."""
         frames = CoarseFrames(self._frames, stride)
         return RobotFrames(frames, self._view.coarser(stride), self._path, *self._placed, self.settings)
+
+    def hand(self, times_ns: Int[Array, " n"]) -> Float[Array, "n 4 4"]:
+        """camera_from_hand at each time; NaN where the joints are not known or the fingers moved since the start: what
+        was held may be gone."""
+        out = np.full((len(times_ns), 4, 4), np.nan)
+        for i, time_ns in enumerate(times_ns + self._delay_ns):
+            if self._path.covers(int(time_ns)) and self._path.may_hold(int(time_ns)):
+                out[i] = (self._base @ self._path.links(int(time_ns))[PANDA_TOOL]).matrix
+        return out
 
     def write(self, folder: Path) -> None:
         """The `certain` pixels of every frame that was looked at, as PNG by position (0 or 255), for the viewer."""

@@ -16,9 +16,8 @@ from numpy import ndarray as Array
 from processing.track import kernels as k
 from processing.track.features import FeatureMatcher, Features, RansacConfig, relative_motions
 from processing.track.keyframes import KeyframeConfig, is_new, references
-from processing.track.motion import MotionConfig, carried_on, change_cost, moved, steady_spin, turn_between
+from processing.track.motion import MotionConfig, carried_on, change_cost, moved, steady_spin, turn_between, turn_grid
 from processing.track.views import ViewStore
-from recordings.geometry import rotation_exp
 
 Schedule = tuple[tuple[int, int, float, float, float, float], ...]
 """Rows of kernels.align_view: level (0 sharp, 1 smooth), steps, depth scale (m at 0.8 m), scale of the looks, outline
@@ -59,7 +58,7 @@ class BeamConfig:
     hold_m: float = 0.01
     """... of this standard deviation."""
     still_share: float = 0.2
-    """Of that standard deviation, where the images say that nothing moved."""
+    """Of that standard deviation, where the images say that nothing moved, or the robot's hand moves the object."""
     motion: MotionConfig = field(default_factory=MotionConfig)
     keyframes: KeyframeConfig = field(default_factory=KeyframeConfig)
     ransac: RansacConfig = field(default_factory=RansacConfig)
@@ -75,6 +74,14 @@ class Scene:
     center_m: Float[Array, "3"]
     matcher: FeatureMatcher
     features: dict[int, Features] = field(default_factory=dict)
+    hand: Float[Array, "n 4 4"] | None = None
+    """The robot's hand (camera_from_hand), which may hold the object; NaN where it is not known."""
+
+    def carried(self, before: int, now: int) -> Float[Array, "4 4"] | None:
+        """How the hand moves from one frame to another (camera axes); None where that is not known."""
+        if self.hand is None or not np.isfinite(self.hand[[before, now], 0, 0]).all():
+            return None
+        return np.asarray(self.hand[now] @ k.inverse(self.hand[before]))
 
     def described(self, view: int) -> Features:
         if view not in self.features:
@@ -144,7 +151,7 @@ def follow(
     for i in order:
         i = int(i)
         if not scene.store.usable(i):
-            beam = [_without(h, i) for h in beam]
+            beam = [replace(h, done=(*h.done, i)) for h in beam]
             continue
         _put_at_color_time(scene, beam[0], i, config)
         grown: list[Hypothesis] = []
@@ -193,10 +200,6 @@ def started(store: ViewStore, count: int, view: int, pose: Float[Array, "4 4"]) 
     return Hypothesis(poses, costs, on, (view,), (view,), 0.0)
 
 
-def _without(h: Hypothesis, i: int) -> Hypothesis:
-    return replace(h, done=(*h.done, i))
-
-
 def _extended(h: Hypothesis, i: int, c: Candidate, scene: Scene, config: BeamConfig) -> Hypothesis:
     """The hypothesis with one more frame; a frame that fits too badly stays without a pose."""
     if c.fit > config.lost or c.on_surface < config.least_on_surface:
@@ -231,9 +234,9 @@ def _differ(a: Hypothesis, b: Hypothesis, i: int, config: BeamConfig) -> bool:
 
 def _branches(scene: Scene, h: Hypothesis, i: int, config: BeamConfig) -> tuple[list[Candidate], list[Candidate]]:
     """Candidates of one hypothesis for frame i: those that may live on, best first, and the others."""
-    still = _standing(scene, h, i, config)
-    if still is not None:
-        return [still], []
+    known = _standing(scene, h, i, config) or _carried(scene, h, i, config)
+    if known is not None:
+        return [known], []
     starts = _usual_starts(scene, h, i)
     found = merged(_aligned_all(scene, h, i, starts, config) + _held(scene, h, i, starts, config), config)
     if not found or found[0].fit > config.doubt:
@@ -277,15 +280,6 @@ def _feature_starts(scene: Scene, h: Hypothesis, i: int, config: BeamConfig) -> 
         for motion in relative_motions(scene.matcher, scene.described(j), here, config.ransac, seed=i, most=2):
             starts.append((f"features of {j}", motion.other_from_one @ h.poses[j]))
     return starts[:8]
-
-
-def turn_grid(angles_deg: tuple[float, ...], axes: int) -> Float[Array, "n 3 3"]:
-    """Rotations by each angle about axes spread evenly over the sphere (Fibonacci)."""
-    n = np.arange(axes) + 0.5
-    z, phi = 1 - 2 * n / axes, np.pi * (1 + 5**0.5) * n
-    r = np.sqrt(1 - z * z)
-    directions = np.stack([r * np.cos(phi), r * np.sin(phi), z], -1)
-    return np.array([rotation_exp(d * np.radians(a)) for a in angles_deg for d in directions])
 
 
 def _searched(
@@ -339,6 +333,15 @@ def _standing(scene: Scene, h: Hypothesis, i: int, config: BeamConfig) -> Candid
         return None
     found = _aligned(scene, h, i, h.poses[last], config.fine, config, "standing", h.poses[last], config.still_share)
     return found if found is not None and found.fit < config.search else None
+
+
+def _carried(scene: Scene, h: Hypothesis, i: int, config: BeamConfig) -> Candidate | None:
+    """The last pose moved as the robot's hand moves, where the images agree: then the hand holds the object."""
+    if (motion := scene.carried(h.tracked[-1], i)) is None:
+        return None
+    pose = motion @ h.poses[h.tracked[-1]]
+    found = _aligned(scene, h, i, pose, config.fine, config, "carried", pose, config.still_share)
+    return found if found is not None and found.fit < config.doubt else None
 
 
 def merged(candidates: list[Candidate], config: BeamConfig) -> list[Candidate]:

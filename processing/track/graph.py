@@ -7,7 +7,8 @@ loop without a feature match; a weak pull towards free flight holds what the ima
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -56,6 +57,12 @@ class GraphConfig:
     still_rad: float = 0.003
     still_m: float = 0.0002
     """What a body that stands still may move between frames (standard deviation)."""
+    carried_rad: float = 0.001
+    carried_m: float = 0.0004
+    """Standard deviation of what a held body moves in the hand from frame to frame (slipping is an outlier) ..."""
+    held_rad: float = 0.08
+    held_m: float = 0.015
+    """... and what moves more is not held."""
     round_body: bool = False
     """Surfaces that turn away from the camera and brightness count little: on a round body they stay with the view."""
     shared_noise: float = 8.0
@@ -85,6 +92,8 @@ class Motion:
     center_m: Float[Array, "3"]
     still: Bool[Array, " n"]
     """Whether the object stands still between each view and the one before it in its toss."""
+    carried: Mapping[tuple[int, int], Float[Array, "4 4"]] = field(default_factory=dict)
+    """How the robot's hand moves (camera axes) from one view to the next."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,6 +227,7 @@ def _add_motion(
     (`_believed`). The residuals are changes of spin (rad/s) and of velocity (m/s), camera axes."""
     index = np.flatnonzero(use)
     _add_still(H, g, poses, index, place, motion, config)
+    _add_carried(H, g, poses, index, place, motion, config)
     if config.jerk_rad_s is not None:
         _add_smooth(H, g, poses, index, place, motion, config.jerk_rad_s)
     for a, b, c in zip(index, index[1:], index[2:]):
@@ -275,17 +285,59 @@ def _add_still(
     for a, b in zip(index, index[1:]):
         if motion.toss[a] != motion.toss[b] or not motion.still[b]:
             continue
-        gap = k.inverse(poses[a]) @ poses[b]  # = exp(twist of a) exp(-twist of b) near the solution
-        residual = np.concatenate([gap[:3, 3], rotation_log(gap[:3, :3])])
-        w = information / (1.0 + residual @ (information * residual) / 9.0)
-        for x, sign in ((a, 1.0), (b, -1.0)):
-            if place[x] < 0:
-                continue
-            g[place[x]] += sign * w * residual
-            H[place[x], place[x]] += np.diag(w)
-        if place[a] >= 0 and place[b] >= 0:
-            H[place[a], place[b]] -= np.diag(w)
-            H[place[b], place[a]] -= np.diag(w)
+        residual = _gap(poses[a], poses[b])
+        _tie(
+            H,
+            g,
+            (int(place[a]), int(place[b])),
+            residual,
+            information / (1.0 + residual @ (information * residual) / 9.0),
+        )
+
+
+def _add_carried(
+    H: Float[Array, "f f 6 6"], g: Float[Array, "f 6"], poses: Float[Array, "n 4 4"], index: Int[Array, " m"],
+    place: Int[Array, " n"], motion: Motion, config: GraphConfig,
+) -> None:  # fmt: skip
+    """Ties each pose to the one before it as the robot's hand moved (robustly: Huber), where it holds the body."""
+    information = np.array([config.carried_m**-2] * 3 + [config.carried_rad**-2] * 3)
+    for a, b in zip(index, index[1:]):
+        if motion.still[b] or not is_held(poses, int(a), int(b), motion, config):
+            continue
+        residual = _gap(motion.carried[int(a), int(b)] @ poses[a], poses[b])
+        weight = information / max(np.sqrt(residual @ (information * residual)) / 3.0, 1.0)
+        _tie(H, g, (int(place[a]), int(place[b])), residual, weight)
+
+
+def is_held(poses: Float[Array, "n 4 4"], a: int, b: int, motion: Motion, config: GraphConfig) -> bool:
+    """Whether the body moves from one view to the next as the robot's hand does."""
+    if (a, b) not in motion.carried:
+        return False
+    off = motion.carried[a, b] @ poses[a] @ k.inverse(poses[b])
+    middle = poses[b][:3, :3] @ motion.center_m + poses[b][:3, 3]
+    turn = np.linalg.norm(rotation_log(off[:3, :3]))
+    return bool(turn < config.held_rad and np.linalg.norm(off[:3, :3] @ middle + off[:3, 3] - middle) < config.held_m)
+
+
+def _gap(one: Float[Array, "4 4"], two: Float[Array, "4 4"]) -> Float[Array, "6"]:
+    """Twist between two poses: that of the first one's view less that of the second's, near the solution."""
+    gap = k.inverse(one) @ two
+    return np.concatenate([gap[:3, 3], rotation_log(gap[:3, :3])])
+
+
+def _tie(
+    H: Float[Array, "f f 6 6"], g: Float[Array, "f 6"], places: tuple[int, int], residual: Float[Array, "6"],
+    weight: Float[Array, "6"],
+) -> None:  # fmt: skip
+    """Adds a `_gap` between two views with these unknowns (-1: fixed)."""
+    a, b = places
+    for x, sign in ((a, 1.0), (b, -1.0)):
+        if x >= 0:
+            g[x] += sign * weight * residual
+            H[x, x] += np.diag(weight)
+    if a >= 0 and b >= 0:
+        H[a, b] -= np.diag(weight)
+        H[b, a] -= np.diag(weight)
 
 
 def motion_residual(

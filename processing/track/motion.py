@@ -144,6 +144,15 @@ def gravity_in_camera(world_from_camera: Float[Array, "4 4"] | None) -> Float[Ar
     return world_from_camera[:3, :3].T @ np.array([0.0, 0.0, -GRAVITY_M_S2])
 
 
+def turn_grid(angles_deg: tuple[float, ...], axes: int) -> Float[Array, "n 3 3"]:
+    """Rotations by each angle about axes spread evenly over the sphere (Fibonacci)."""
+    n = np.arange(axes) + 0.5
+    z, phi = 1 - 2 * n / axes, np.pi * (1 + 5**0.5) * n
+    r = np.sqrt(1 - z * z)
+    directions = np.stack([r * np.cos(phi), r * np.sin(phi), z], -1)
+    return np.array([rotation_exp(d * np.radians(a)) for a in angles_deg for d in directions])
+
+
 def all_turns(count: int) -> Float[Array, "n 3 3"]:
     """Rotations spread over all orientations: directions of the axis, and turns about it."""
     about = max(4, round((count * 1.6) ** (1 / 3)))

@@ -148,8 +148,7 @@ def register_tosses(
     fixed = pool.toss == root
     if model is None:
         fixed[1:] = False
-    whole = np.array([n if t.round_body else -1 for n, t in enumerate(tosses)] + [-1] * (count - len(tosses)))
-    poses = _refined(pool, np.isfinite(fit), placing.first_from_own, fixed, whole[pool.toss], config)
+    poses = _refined(pool, np.isfinite(fit), placing.first_from_own, fixed, _tied(tosses, pool), config)
     fit, gap, first_from_own = fit[: len(tosses)], gap[: len(tosses)], placing.first_from_own[: len(tosses)]
     tracks = [_moved_track(toss, pool, t, poses, bool(np.isfinite(fit[t]))) for t, toss in enumerate(tosses)]
     joined = np.isfinite(fit)
@@ -180,6 +179,16 @@ def _placed(placing: _Placing, tosses: list[int], progress: Progress) -> Float[A
     return gap
 
 
+def _tied(tosses: Sequence[TossTrack], pool: Pool) -> Int[Array, " n"]:
+    """Views with the same number move as one; those with -1 alone."""
+    out = np.full(len(pool.toss), -1)
+    for n, toss in enumerate(tosses):
+        mine = pool.toss == n
+        tied = toss.tied[pool.frame[mine]]
+        out[mine] = np.where(tied >= 0, len(tosses) * tied + n, -1)
+    return out
+
+
 def _gap(found: list[Fit]) -> float:
     """How much more the second of several placements is contradicted than the first."""
     return found[1].cost - found[0].cost if len(found) > 1 else float("inf")
@@ -187,17 +196,17 @@ def _gap(found: list[Fit]) -> float:
 
 def _refined(
     pool: Pool, joined: Bool[Array, " t"], first_from_own: Float[Array, "t 4 4"], fixed: Bool[Array, " n"],
-    whole: Int[Array, " n"], config: RegisterConfig,
+    tied: Int[Array, " n"], config: RegisterConfig,
 ) -> Float[Array, "n 4 4"]:  # fmt: skip
     """All keyframes of all joined tosses at once (the first toss's first one is fixed, or a learned shape's views);
-    poses in the common frame. Views of a toss in `whole` (else -1) move as one."""
+    poses in the common frame. Views with the same number in `tied` move as one."""
     poses = np.array([p @ np.linalg.inv(first_from_own[t]) for p, t in zip(pool.poses, pool.toss)])
     use = joined[pool.toss]
     none = np.zeros(len(poses), dtype=bool)
     # keyframes are far apart in time: the pull towards free flight says nothing between them
     motion = Motion(pool.frame.astype(np.float64), np.arange(len(poses)), np.zeros(3), pool.center_m, none)
     graph = replace(config.joint, spread_in_time=1)
-    return refine(pool.store, poses, use, fixed, motion, graph, tied=whole).poses
+    return refine(pool.store, poses, use, fixed, motion, graph, tied=tied).poses
 
 
 def _moved_track(

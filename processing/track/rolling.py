@@ -44,9 +44,9 @@ class RollConfig:
 
 
 @dataclass(frozen=True, eq=False)
-class Rolled:
-    """From view to view: the turn about the axis that rolling makes, as `Pace.base_rad` counts it, and its standard
-    deviation (infinite where the body does not roll)."""
+class Told:
+    """From view to view: the turn about the axis that something else than the images tells, as `Pace.base_rad` counts
+    it, and its standard deviation (infinite where nothing does)."""
 
     turn_rad: Float[Array, " r"]
     sigma_rad: Float[Array, " r"]
@@ -86,7 +86,7 @@ def grounded(
     return Grounded(poses, [table_of(store, int(i)) for i in views], axis, rings)
 
 
-def rolled(body: Grounded, steps_s: Float[Array, " r"], config: RollConfig) -> Rolled:
+def rolled(body: Grounded, steps_s: Float[Array, " r"], config: RollConfig) -> Told:
     """What the poses of consecutive views say, whatever their turns about the axis.
 
     The point p of the body that touches the table does not move: v + w x (p - c) = 0, where w = s a + what turns the
@@ -111,7 +111,7 @@ def rolled(body: Grounded, steps_s: Float[Array, " r"], config: RollConfig) -> R
         turn[one] = float(way @ arm) / float(arm @ arm)
         off = max(abs(float(x.min())) for x in low)
         sigma[one] = float(np.hypot(config.slip_m, config.off_share * off) / np.linalg.norm(arm))
-    return Rolled(turn, sigma)
+    return Told(turn, sigma)
 
 
 def sunk(

@@ -71,6 +71,16 @@ class TossTrack:
     store: ViewStore
     round_body: bool = False
     """Whether the body is round and its turn was found from all frames at once: pairs of views alone would spoil it."""
+    held: tuple[tuple[int, ...], ...] = ()
+    """Frames in a row through which a robot's hand carries the body: how they lie to each other is known."""
+
+    @property
+    def tied(self) -> Int[Array, " n"]:
+        """Frames with the same number lie to each other as they do; -1: no others."""
+        out = np.full(len(self.cost), 0 if self.round_body else -1)
+        for n, run in enumerate(() if self.round_body else self.held):
+            out[list(run)] = n
+        return out
 
     @property
     def unfit(self) -> int:
@@ -111,12 +121,13 @@ def track_toss(
     model: ObjectShape | None = None,
     colorless: Sequence[Bool[Array, "h w"]] | None = None,
     matcher: FeatureMatcher | None = None,
+    hand: Float[Array, "n 4 4"] | None = None,
 ) -> TossTrack:
     """Poses `camera_from_object` of all colour frames of one toss, without a model of the object unless one is given.
 
     masks: the object's visible pixels in each colour frame; confidence: how sure each is (0..1); colorless: pixels of
     the masks that show something else's colour (an occluder before depth that was drawn). world_from_camera tells
-    gravity and the table (z = 0).
+    gravity and the table (z = 0); hand: camera_from_hand of a robot that may hold the object (NaN where it does not).
 
     The object frame is parallel to the camera at the first usable frame, its origin at the middle of the cloud seen
     there; or `start` gives camera_from_object of frame `start_frame` (None: the first usable one), which is kept.
@@ -134,7 +145,7 @@ def track_toss(
     first = _first(store, known, len(frames), toss, config)
     world = None if world_from_camera is None else world_from_camera.matrix
     middle = _middle(store, first, known) if model is None else middle_of(model)
-    scene = Scene(store, times_s, gravity_in_camera(world), middle, matcher or Sift())
+    scene = Scene(store, times_s, gravity_in_camera(world), middle, matcher or Sift(), hand=hand)
     if known.poses is None:
         stories, margin, rejected = _followed(scene, first, known, config, progress)
     else:
@@ -357,4 +368,4 @@ def _told(
         if apart_deg(joint.poses[:n], other.joint.poses[:n]) > config.story.agreeing_deg:
             margin = min(margin, other.total - best.total)
     return TossTrack(track, cost, on, keyframes, pairs, rejected, best.center_m, margin, scene.store,
-                     best.axis is not None)  # fmt: skip
+                     best.axis is not None, best.held)  # fmt: skip

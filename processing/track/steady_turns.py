@@ -8,13 +8,14 @@ rolls (rolling.py).
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray as Array
 
 from processing.track.beam import Scene
-from processing.track.rolling import Grounded, RollConfig, Rolled, rolled
+from processing.track.rolling import Grounded, RollConfig, Told, rolled
 from recordings.geometry import rotation_log
 
 STARTING = 0.6
@@ -41,19 +42,24 @@ class SteadyConfig:
     flight_m_s: float = 0.15
     """A change of velocity, beyond gravity's, below this is free flight."""
     roll: RollConfig = field(default_factory=RollConfig)
+    carried_rad: float = 0.05
+    carried_m: float = 0.006
+    """From view to view, an axis that moves as the robot's hand does within these is carried ..."""
+    slips_rad: float = 0.004
+    """... and turns in it by no more than this (standard deviation)."""
 
 
 @dataclass(frozen=True, eq=False)
 class Pace:
-    """Between views: turn about the axis so far (v-1) and seconds, and what rolling on the table makes it; of views:
-    whether it stands for frames without motion, whether it flies, and the price of a change of spin there."""
+    """Between views: turn about the axis so far (v-1) and seconds, and what rolling on the table or a hand makes it; of
+    views: whether it stands for frames without motion, whether it flies, and the price of a change of spin there."""
 
     base_rad: Float[Array, " r"]
     steps_s: Float[Array, " r"]
     still: Bool[Array, " v"]
     flies: Bool[Array, " v"]
     price: Float[Array, " v"]
-    rolled: Rolled
+    told: Told
 
 
 def pace_of(
@@ -76,7 +82,25 @@ def pace_of(
         change = change - 0.5 * (steps_s[n] + steps_s[n - 1]) * scene.gravity_camera_m_s2
         flies[n] = not still[n] and np.linalg.norm(change) < config.flight_m_s
     price = np.where(flies, config.flight_price, 1.0)
-    return Pace(base, steps_s, still, flies, price, rolled(body, steps_s, config.roll))
+    told = _carried(scene, views, body, rolled(body, steps_s, config.roll), config)
+    return Pace(base, steps_s, still, flies, price, told)
+
+
+def _carried(scene: Scene, views: Int[Array, " v"], body: Grounded, told: Told, config: SteadyConfig) -> Told:
+    """With the turns of what the robot's hand carries: where the axis moves as the hand does."""
+    turn, sigma = told.turn_rad.copy(), told.sigma_rad.copy()
+    middle = body.axis.point_m + body.rings[:, 0].mean() * body.axis.direction
+    for n, (a, b) in enumerate(pairwise(views)):
+        if (moved := scene.carried(int(a), int(b))) is None:
+            continue
+        pose = moved @ body.poses[n]
+        off = (pose - body.poses[n + 1])[:3]
+        if np.linalg.norm(off[:, :3] @ body.axis.direction) > config.carried_rad:
+            continue
+        if np.linalg.norm(off[:, :3] @ middle + off[:, 3]) < config.carried_m:
+            turn[n] = rotation_log(pose[:3, :3].T @ body.poses[n, :3, :3]) @ body.axis.direction
+            sigma[n] = config.slips_rad
+    return Told(turn, sigma)
 
 
 def steadied(
@@ -101,7 +125,7 @@ def steadied(
             weight = pace.price[view] / (1 + (change / (2 * usual)) ** 2) / usual**2
             g += weight * change * slope
             H += weight * np.outer(slope, slope)
-        _roll(H, g, angle, pace)
+        _add_told(H, g, angle, pace)
         g[first], H[first], H[:, first] = 0.0, 0.0, 0.0
         H[first, first] = 1e9
         step = -np.linalg.solve(H + 1e-7 * np.diag(np.diag(H)) + 1e-6 * np.eye(len(H)), g)
@@ -135,10 +159,10 @@ def _of_pairs(
     return H, g
 
 
-def _roll(H: Float[Array, "v v"], g: Float[Array, " v"], angle: Float[Array, " v"], pace: Pace) -> None:
-    """Adds to the normal equations that the turns from view to view are those that rolling makes."""
-    off = pace.base_rad - np.diff(angle) - pace.rolled.turn_rad
-    weight = 1 / (pace.rolled.sigma_rad**2 + (off / 2) ** 2)
+def _add_told(H: Float[Array, "v v"], g: Float[Array, " v"], angle: Float[Array, " v"], pace: Pace) -> None:
+    """Adds to the normal equations the turns from view to view that are told."""
+    off = pace.base_rad - np.diff(angle) - pace.told.turn_rad
+    weight = 1 / (pace.told.sigma_rad**2 + (off / 2) ** 2)
     before = np.arange(len(off))
     np.add.at(g, before, weight * off)
     np.add.at(g, before + 1, -weight * off)

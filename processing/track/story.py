@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -12,7 +13,7 @@ from processing.track.beam import LEAST_DELAY_S, Hypothesis, Scene
 from processing.track.delay import put_at_color_times
 from processing.track.evidence import EvidenceConfig, evidence
 from processing.track.flags import per_view
-from processing.track.graph import GraphConfig, Motion, Refined, refine, round_views, steady_motion
+from processing.track.graph import GraphConfig, Motion, Refined, is_held, refine, round_views, steady_motion
 from processing.track.middle import center_of_mass
 from processing.track.motion import MotionConfig, change_cost, turn_between
 from processing.track.round_axis import Axis, open_axis
@@ -58,6 +59,8 @@ class Story:
     turned: Turned | None = None
     axis: Axis | None = None
     """Of a round body, all of whose views were laid onto one profile."""
+    held: tuple[tuple[int, ...], ...] = ()
+    """Frames in a row through which the robot's hand carries it."""
     against: float = 0.0
     """What the looks say against it, beside the story that fits best, in units of badness."""
 
@@ -189,7 +192,7 @@ def refined(
     if _delayed(scene):
         use = use & put_at_color_times(scene, poses[:n], use)
     center_m = center_of_mass(poses[:n], use, scene)
-    motion = Motion(times_s, whose, scene.gravity_camera_m_s2, center_m, still)
+    motion = Motion(times_s, whose, scene.gravity_camera_m_s2, center_m, still, _carried(scene, use))
     seen = np.concatenate([use, drawn])
     if axis is None:
         joint = refine(scene.store, poses, seen, fixed, motion, config.graph)
@@ -201,7 +204,29 @@ def refined(
         joint = replace(joint, poses=moved, covariance=spread)
     fit = np.nanmean(per_view(joint.pairs, joint.figures, all_views)[0][:n]) if len(joint.pairs) else 0.0
     price = mean_price(joint.poses[:n], use, scene, center_m, config.motion)
-    return Story(best, use, fixed, joint, center_m, motion, float(fit + price), axis=axis)
+    runs = _held(joint.poses, use, motion, config.graph)
+    return Story(best, use, fixed, joint, center_m, motion, float(fit + price), axis=axis, held=runs)
+
+
+def _carried(scene: Scene, use: Bool[Array, " n"]) -> dict[tuple[int, int], Float[Array, "4 4"]]:
+    """How the robot's hand moves from each used frame to the next."""
+    found = {(int(a), int(b)): scene.carried(int(a), int(b)) for a, b in pairwise(np.flatnonzero(use))}
+    return {pair: moved for pair, moved in found.items() if moved is not None}
+
+
+def _held(
+    poses: Float[Array, "v 4 4"], use: Bool[Array, " n"], motion: Motion, config: GraphConfig
+) -> tuple[tuple[int, ...], ...]:
+    """Frames in a row through which the robot's hand carries the body."""
+    runs: list[list[int]] = []
+    for a, b in pairwise(map(int, np.flatnonzero(use))):
+        if not is_held(poses, a, b, motion, config):
+            continue
+        if runs and runs[-1][-1] == a:
+            runs[-1].append(b)
+        else:
+            runs.append([a, b])
+    return tuple(map(tuple, runs))
 
 
 def mean_price(

@@ -97,11 +97,11 @@ def differences(looks, count, pairs, state, every, width, out):
 
 @no_type_check
 @njit(cache=True, nogil=True, fastmath=True)
-def spin_cost(state, base, steps_s, still, price, rolled, slip, step, motion, a, b):
+def spin_cost(state, base, steps_s, still, price, told, slack, step, motion, a, b):
     """Price of the changes of spin within the views a..b. base (v-1): turn about the axis from view to view at state 0
-    (rad); still (v): whether a view stands for frames without motion; price (v); rolled, slip (v-1): turn that rolling
-    on the table makes and its standard deviation (infinite where it does not roll); motion: usual change, fast spin,
-    price of faster."""
+    (rad); still (v): whether a view stands for frames without motion; price (v); told, slack (v-1): turn that something
+    else tells and its standard deviation (infinite where nothing does); motion: usual change, fast spin, price of
+    faster."""
     usual, fast, dear = motion[0], motion[1], motion[2]
     total, last, known = 0.0, 0.0, False
     for t in range(a, b + 1):
@@ -113,9 +113,9 @@ def spin_cost(state, base, steps_s, still, price, rolled, slip, step, motion, a,
             break
         turn = base[t] - (state[t + 1] - state[t]) * step
         turn -= 2.0 * np.pi * np.floor(turn / (2.0 * np.pi) + 0.5)
-        off = turn - rolled[t]
+        off = turn - told[t]
         off -= 2.0 * np.pi * np.floor(off / (2.0 * np.pi) + 0.5)
-        total += np.log(1.0 + (off / slip[t]) ** 2)
+        total += np.log(1.0 + (off / slack[t]) ** 2)
         rate = turn / steps_s[t]
         if known:
             total += price[t] * np.log(1.0 + ((rate - last) / usual) ** 2)
@@ -126,9 +126,9 @@ def spin_cost(state, base, steps_s, still, price, rolled, slip, step, motion, a,
 
 @no_type_check
 @njit(cache=True, nogil=True, fastmath=True)
-def energy(state, costs, pairs, base, steps_s, still, price, rolled, slip, step, motion):
+def energy(state, costs, pairs, base, steps_s, still, price, told, slack, step, motion):
     """What the pairs (costs (m, cells), cyclic) and the changes of spin cost together."""
-    total = spin_cost(state, base, steps_s, still, price, rolled, slip, step, motion, 0, len(state) - 1)
+    total = spin_cost(state, base, steps_s, still, price, told, slack, step, motion, 0, len(state) - 1)
     for m in range(pairs.shape[0]):
         total += costs[m, (state[pairs[m, 0]] - state[pairs[m, 1]]) % costs.shape[1]]
     return total
@@ -163,7 +163,7 @@ def _ramp(state, a, length, q, cells, trial, b):
 @njit(cache=True, nogil=True, fastmath=True)
 def _ramp_costs(state, a, length, costs, pairs, rest, out, trial):
     """Into out (cells): what the pairs and the changes of spin that a ramp changes cost, by how far it turns."""
-    base, steps_s, still, price, rolled, slip, step, motion = rest
+    base, steps_s, still, price, told, slack, step, motion = rest
     v, cells = len(state), costs.shape[1]
     out[:] = 0.0
     for m in range(pairs.shape[0]):
@@ -179,16 +179,16 @@ def _ramp_costs(state, a, length, costs, pairs, rest, out, trial):
     trial[lo : hi + 1] = state[lo : hi + 1]
     for q in range(cells):
         _ramp(state, a, length, q, cells, trial, hi)
-        out[q] += spin_cost(trial, base, steps_s, still, price, rolled, slip, step, motion, lo, hi)
+        out[q] += spin_cost(trial, base, steps_s, still, price, told, slack, step, motion, lo, hi)
 
 
 @no_type_check
 @njit(cache=True, nogil=True, fastmath=True)
-def settle(state, costs, pairs, base, steps_s, still, price, rolled, slip, step, motion, sweeps, longest):
+def settle(state, costs, pairs, base, steps_s, still, price, told, slack, step, motion, sweeps, longest):
     """Turns runs of views, ends of the toss, and ends reached by a ramp, until none wants to turn; view 0 stays."""
     v, cells = len(state), costs.shape[1]
     out, trial = np.zeros(cells), state.copy()
-    rest = base, steps_s, still, price, rolled, slip, step, motion
+    rest = base, steps_s, still, price, told, slack, step, motion
     for _ in range(sweeps):
         changed = False
         for length in range(longest):
@@ -202,7 +202,7 @@ def settle(state, costs, pairs, base, steps_s, still, price, rolled, slip, step,
                 best, least = 0, 0.0
                 for q in range(cells):
                     trial[a : min(b, hi) + 1] = (state[a : min(b, hi) + 1] + q) % cells
-                    e = out[q] + spin_cost(trial, base, steps_s, still, price, rolled, slip, step, motion, lo, hi)
+                    e = out[q] + spin_cost(trial, base, steps_s, still, price, told, slack, step, motion, lo, hi)
                     if q == 0 or e < least - 1e-9:
                         best, least = q, e
                 if best:
@@ -224,7 +224,7 @@ def settle(state, costs, pairs, base, steps_s, still, price, rolled, slip, step,
 
 @no_type_check
 @njit(cache=True, nogil=True, fastmath=True)
-def greedy(v, costs, pairs, base, steps_s, still, price, rolled, slip, step, motion):
+def greedy(v, costs, pairs, base, steps_s, still, price, told, slack, step, motion):
     """Each view where those before want it."""
     cells = costs.shape[1]
     state, e = np.zeros(v, np.int64), np.zeros(cells)
@@ -239,7 +239,7 @@ def greedy(v, costs, pairs, base, steps_s, still, price, rolled, slip, step, mot
         for q in range(cells):
             state[t] = q
             lo = max(t - 2, 0)
-            e[q] += spin_cost(state, base, steps_s, still, price, rolled, slip, step, motion, lo, t)
+            e[q] += spin_cost(state, base, steps_s, still, price, told, slack, step, motion, lo, t)
             if e[q] < e[best]:
                 best = q
         state[t] = best
@@ -248,12 +248,12 @@ def greedy(v, costs, pairs, base, steps_s, still, price, rolled, slip, step, mot
 
 @no_type_check
 @njit(cache=True, nogil=True, fastmath=True)
-def spreads(state, costs, pairs, base, steps_s, still, price, rolled, slip, step, motion):
+def spreads(state, costs, pairs, base, steps_s, still, price, told, slack, step, motion):
     """Variance (rad^2) of each view's turn against view 0: the widest of the moves that turn it, each with the
     probability that its energy leaves it."""
     v, cells = len(state), costs.shape[1]
     out, trial, e, var = np.zeros(cells), state.copy(), np.zeros(cells), np.zeros(v)
-    rest = base, steps_s, still, price, rolled, slip, step, motion
+    rest = base, steps_s, still, price, told, slack, step, motion
     for length in range(v):
         for a in range(1, v):
             b = v - 1 if length == 0 else a + length - 1
@@ -264,7 +264,7 @@ def spreads(state, costs, pairs, base, steps_s, still, price, rolled, slip, step
             trial[lo : hi + 1] = state[lo : hi + 1]
             for q in range(cells):
                 trial[a : min(b, hi) + 1] = (state[a : min(b, hi) + 1] + q) % cells
-                e[q] = out[q] + spin_cost(trial, base, steps_s, still, price, rolled, slip, step, motion, lo, hi)
+                e[q] = out[q] + spin_cost(trial, base, steps_s, still, price, told, slack, step, motion, lo, hi)
             _widen(var, e, a, b, 1, step)
     for length in RAMPS:
         for a in range(1, v - 1):

@@ -190,8 +190,8 @@ def _weighed(
     shape = np.minimum(_above_least(shape), config.most_shape)
     shape += _sunk(body, charts, frames, step * np.arange(config.cells), config)
     motion = np.array([config.spin_change_rad_s, config.fast_rad_s, config.fast_price])
-    rolls = pace.rolled.turn_rad, pace.rolled.sigma_rad
-    return looks, shape, (frames.pairs, pace.base_rad, pace.steps_s, pace.still, pace.price, *rolls, step, motion)
+    told = pace.told.turn_rad, pace.told.sigma_rad
+    return looks, shape, (frames.pairs, pace.base_rad, pace.steps_s, pace.still, pace.price, *told, step, motion)
 
 
 def _sunk(

@@ -15,10 +15,12 @@ from recordings.results import (
     TossRecord,
     VariantRecord,
     read_contact,
+    read_hand,
     read_masks,
     read_shape,
     read_track,
     write_contact,
+    write_hand,
     write_masks,
     write_shape,
     write_track,
@@ -94,6 +96,14 @@ def test_masks_come_back_with_their_confidence(tmp_path: Path) -> None:
     for a, b in zip(back, masks):
         np.testing.assert_array_equal(a, b)
     assert back.confidence.tolist() == [1.0, 0.5, 0.0]
+
+
+def test_the_robots_hand_comes_back(tmp_path: Path) -> None:
+    hand = np.random.default_rng(0).normal(size=(3, 4, 4))
+    hand[1] = np.nan
+    write_hand(tmp_path, 4, hand)
+    np.testing.assert_array_equal(read_hand(tmp_path, 4), hand)
+    assert read_hand(tmp_path, 5) is None
 
 
 def test_a_contact_model_comes_back(tmp_path: Path) -> None:

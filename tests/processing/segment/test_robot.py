@@ -26,7 +26,7 @@ from recordings.collada import read_collada
 from recordings.geometry import CameraModel, Transform, rotation_exp, rotation_log
 from recordings.progress import Silent
 from recordings.records import ArmStates, RgbdFrame
-from recordings.robot import ArmPath, panda
+from recordings.robot import PANDA_TOOL, ArmPath, panda
 from recordings.session import RgbdFrames, Session
 from recordings.tracks import RigCalibration
 
@@ -196,6 +196,18 @@ def test_frames_outside_of_the_joint_states_have_no_robot(view: RobotView, wall:
     robot = RobotFrames([frame], view, ArmPath(panda(), states()), CAMERA_FROM_BASE)
     assert robot.seen(frame, 0) is None
     assert not robot[0].any()
+
+
+def test_the_hand_is_known_while_the_fingers_stay_as_they_were(view: RobotView) -> None:
+    said = states()
+    opened = replace(said, finger_width_m=np.where(said.time_ns < 600_000_000, 0.05, 0.07))
+    path = ArmPath(panda(), opened)
+    robot = RobotFrames([], view, path, CAMERA_FROM_BASE, delay_s=0.01)
+    times_ns = np.array([0, 300_000_000, 589_000_000, 700_000_000, 9_000_000_000])
+    hand = robot.hand(times_ns)
+    assert np.isfinite(hand[:, 0, 0]).tolist() == [True, True, True, False, False]
+    root = CAMERA_FROM_BASE @ Transform.identity("base", path.robot.root)
+    np.testing.assert_allclose(hand[1], (root @ path.links(310_000_000)[PANDA_TOOL]).matrix)
 
 
 def table_scene(tiny_world: Any, factor: float, tilt_deg: float = 0.0) -> tuple[StaticScene, Transform]:

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+from unittest.mock import Mock
+
 import numpy as np
 import pytest
 from numpy import ndarray as Array
 
-from processing.track.rolling import Grounded, RollConfig, rolled, sunk
+from processing.track.beam import Scene
+from processing.track.features import Sift
+from processing.track.rolling import Grounded, RollConfig, Told, rolled, sunk
 from processing.track.round_axis import Axis
-from recordings.geometry import rotation_exp
+from processing.track.steady_turns import SteadyConfig, _carried
+from processing.track.views import ViewStore
+from recordings.geometry import rotation_exp, rotation_log
 
 RADIUS, HALF, STEP_S = 0.04, 0.05, 1 / 30
 AXIS = Axis(np.array([0.0, 0.0, 1.0]), np.array([0.003, -0.002, 0.0]))
@@ -91,6 +97,28 @@ def test_a_body_that_seems_off_the_table_rolls_less_surely() -> None:
         p[:3, 3] -= CAMERA @ [0.0, 0.0, 0.01]
     sure, unsure = (rolled(beside_table(p), steps_s, RollConfig()).sigma_rad for p in (poses, deep))
     assert (unsure > 1.4 * sure).all()
+
+
+def test_what_the_robots_hand_carries_turns_as_the_hand_does() -> None:
+    rng = np.random.default_rng(1)
+    hand = np.array([lying(rotation_exp(rng.normal(0, 0.2, 3)), rng.normal(0, 0.02, 3)) for _ in range(6)])
+    held = [h @ np.linalg.inv(hand[0]) @ lying(np.eye(3), np.zeros(3)) for h in hand]
+    for p in held[4:]:
+        p[:3, 3] += 0.02 * (len(held) - 3)  # it slips from frame 4 on
+    held[5][:3, 3] += 0.1
+    hidden = hand.copy()
+    hidden[2] = np.nan
+    free = Told(np.zeros(5), np.full(5, np.inf))
+    for known, carried in ((hand, [0, 1, 2]), (hidden, [0])):
+        scene = Scene(Mock(spec=ViewStore), np.arange(6) / 30, np.zeros(3), np.zeros(3), Sift(), hand=known)
+        found = _carried(scene, np.arange(6), beside_table(own_turns(held)), free, SteadyConfig())
+        assert np.flatnonzero(np.isfinite(found.sigma_rad)).tolist() == carried
+        turned = beside_table(own_turns(held)).poses
+        for n in carried:  # the second view's turn that goes with the hand, told as its pose's error is
+            between = rotation_log(turned[n + 1, :3, :3].T @ (hand[n + 1] @ np.linalg.inv(hand[n]) @ turned[n])[:3, :3])
+            own = rotation_log(turned[n + 1, :3, :3].T @ turned[n, :3, :3]) @ AXIS.direction
+            off = (own - found.turn_rad[n] - between @ AXIS.direction + np.pi) % (2 * np.pi) - np.pi
+            assert abs(off) < 0.05
 
 
 def test_a_handle_does_not_sink_into_the_table() -> None:

@@ -216,6 +216,27 @@ def test_a_given_start_is_kept(tiny_world: Any, toss: Any) -> None:
     np.testing.assert_allclose(track.camera_from_object[0], toss[2][0], atol=1e-12)
 
 
+def test_what_a_robots_hand_carries_moves_as_the_hand_does(tiny_world: Any, toss: Any, tracked: TossTrack) -> None:
+    grasp = pose_of(np.array([0.02, -0.01, 0.05, 0.3, 1.0, -0.4]))
+    held = followed(tiny_world, toss, hand=toss[2] @ grasp).track.camera_from_object
+    free = tracked.track.camera_from_object
+    errors = [
+        frame_errors(found @ align_first(found, toss[2]), toss[2], np.eye(3) * 0.05).rotation_deg.mean()
+        for found in (held, free)
+    ]
+    assert errors[0] < min(0.7 * errors[1], 0.5)
+
+
+def test_a_hand_that_does_not_hold_the_object_changes_nothing(tiny_world: Any, toss: Any, tracked: TossTrack) -> None:
+    elsewhere = np.tile(np.eye(4), (COUNT, 1, 1))
+    elsewhere[:, :3, 3] = 0.3 * toss[2][:, [1, 2, 0], 3]
+    elsewhere[-2:] = np.nan
+    found = followed(tiny_world, toss, hand=elsewhere).track.camera_from_object
+    errors = frame_errors(found, tracked.track.camera_from_object, np.eye(3) * 0.05)
+    assert errors.rotation_deg.max() < 0.3
+    assert errors.translation_m.max() < 0.001
+
+
 def test_the_same_input_gives_the_same_track(tiny_world: Any, toss: Any, tracked: TossTrack) -> None:
     again = followed(tiny_world, toss)
     np.testing.assert_array_equal(again.track.camera_from_object, tracked.track.camera_from_object)

@@ -13,7 +13,7 @@ from processing.track.beam import Scene
 from processing.track.charts import ChartConfig, Charts, _heights, _off, _Pixels, _shines
 from processing.track.features import Sift
 from processing.track.optics import Optics
-from processing.track.rolling import Rolled
+from processing.track.rolling import Told
 from processing.track.round_axis import Axis, AxisConfig, open_axis
 from processing.track.steady_turns import Pace, SteadyConfig, steadied
 from processing.track.turns import TurnConfig, Turned, _believed, _Frames, _usual, doubted, turns_of_standing
@@ -84,14 +84,14 @@ def test_a_box_has_no_open_turn() -> None:
 def pace(views: int, flies: bool = False) -> Pace:
     nothing = np.zeros(views - 1)
     no = np.zeros(views, dtype=bool)
-    return Pace(nothing, np.full(views - 1, 1 / 30), no, no | flies, np.ones(views), Rolled(nothing, nothing + np.inf))
+    return Pace(nothing, np.full(views - 1, 1 / 30), no, no | flies, np.ones(views), Told(nothing, nothing + np.inf))
 
 
 def given(costs: np.ndarray, pairs: np.ndarray, views: int) -> tuple[object, ...]:
     p = pace(views)
-    rolls = p.rolled.turn_rad, p.rolled.sigma_rad
+    told = p.told.turn_rad, p.told.sigma_rad
     step, motion = 2 * np.pi / costs.shape[1], np.array([1.5, 25.0, 20.0])
-    return costs, pairs, p.base_rad, p.steps_s, p.still, p.price, *rolls, step, motion
+    return costs, pairs, p.base_rad, p.steps_s, p.still, p.price, *told, step, motion
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
@@ -142,7 +142,7 @@ def test_a_stretch_that_shows_nothing_turns_as_the_body_rolls() -> None:
     pairs = np.array([(a, b) for a in range(6) for b in range(a)])
     offsets = np.arange(-reach, reach + 1)[None] * cell - (truth[pairs[:, 0]] - truth[pairs[:, 1]])[:, None]
     costs = np.minimum(np.abs(offsets) / cell, 6.0)
-    rolling = replace(pace(views), rolled=Rolled(-np.diff(truth), np.full(views - 1, 0.02)))
+    rolling = replace(pace(views), told=Told(-np.diff(truth), np.full(views - 1, 0.02)))
     nothing = np.zeros((views, views)), np.zeros(views)
     blind, doubt = steadied(costs, pairs, nothing, pace(views), cell, 0, SteadyConfig())
     angle, sigma = steadied(costs, pairs, nothing, rolling, cell, 0, SteadyConfig())
