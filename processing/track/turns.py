@@ -147,6 +147,7 @@ def turned(
     frames = _frames(scene, use, config)
     if len(frames.pairs) == 0:
         return Turned(poses, np.zeros(len(poses)), axis)
+    poses = _stood(poses, frames, axis, first)
     step = 2 * np.pi / config.cells
     looks, shape, rest = _weighed(scene, poses, frames, axis, config)
     starts = [np.zeros(len(frames.views), dtype=np.int64)]
@@ -184,7 +185,8 @@ def _weighed(
     body = grounded(scene.store, frames.views, poses[frames.views], axis, charts.rings)
     pace = pace_of(scene, poses, frames.runs, frames.views, body, config.steady)
     looks, shape = _said(charts, frames.pairs, config.cells // 2, None, config)
-    looks, shape = (_cyclic(c, config.cells) for c in (looks, -shape))
+    # from turns by -cells/2..cells/2 to turns by 0..cells-1
+    looks, shape = (np.roll(c[:, :-1], -(config.cells // 2), axis=1) for c in (looks, -shape))
     looks = np.minimum(np.maximum(_above_least(looks) - config.pair_dead, 0.0), config.most_looks)
     step = 2 * np.pi / config.cells
     shape = np.minimum(_above_least(shape), config.most_shape)
@@ -256,6 +258,14 @@ def steady(scene: Scene, found: Turned, use: Bool[Array, " n"], first: int, conf
     return replace(found, poses=poses, sigma_rad=np.sqrt(found.sigma_rad**2 + spread**2))
 
 
+def _stood(poses: Float[Array, "n 4 4"], frames: _Frames, axis: Axis, first: int) -> Float[Array, "n 4 4"]:
+    """Frames of one run turned as their view is; the first frame's pose stays, the others turn with its run."""
+    angle = np.zeros(len(poses))
+    for run, view in zip(frames.runs, frames.views):
+        angle[run] = _angles(poses[run], np.broadcast_to(poses[view], (len(run), 4, 4)), axis)
+    return np.array([p @ axis.turn(float(a - angle[first])) for p, a in zip(poses, angle)])
+
+
 def _moved(
     poses: Float[Array, "n 4 4"], frames: _Frames, angle: Float[Array, " v"], axis: Axis, first: int
 ) -> Float[Array, "n 4 4"]:
@@ -323,11 +333,6 @@ def _said(
 
 def _above_least(costs: Float[Array, "m d"]) -> Float[Array, "m d"]:
     return costs - costs.min(1, keepdims=True)
-
-
-def _cyclic(costs: Float[Array, "m d"], cells: int) -> Float[Array, "m c"]:
-    """From turns by -cells/2..cells/2 to turns by 0..cells-1."""
-    return np.roll(costs[:, : costs.shape[1] - 1], -(cells // 2), axis=1)
 
 
 def _differences(

@@ -16,7 +16,7 @@ from processing.track.optics import Optics
 from processing.track.rolling import Told
 from processing.track.round_axis import Axis, AxisConfig, open_axis
 from processing.track.steady_turns import Pace, SteadyConfig, steadied
-from processing.track.turns import TurnConfig, Turned, _believed, _Frames, _usual, doubted, turns_of_standing
+from processing.track.turns import TurnConfig, Turned, _believed, _Frames, _stood, _usual, doubted, turns_of_standing
 from processing.track.views import Crop, ViewConfig, ViewStore
 from recordings.geometry import CameraModel, rotation_exp
 
@@ -212,6 +212,20 @@ def test_the_table_seen_through_a_handle_stands_not_off_the_body() -> None:
                 np.zeros(n), heights_m, np.zeros((n, k.SAMPLE), np.float32))  # fmt: skip
     *_, off = _off(p, np.full(20, 0.04), 0.0, ChartConfig())
     assert off.tolist() == [False, False, True, True, True]
+
+
+def test_frames_between_which_the_body_stands_still_turn_together() -> None:
+    rng = np.random.default_rng(3)
+    axis = Axis(np.array([0.0, 1.0, 0.0]), np.array([0.01, 0.0, 0.02]))
+    stands = np.eye(4)
+    stands[:3, :3], stands[:3, 3] = rotation_exp(np.array([0.4, -0.3, 1.0])), [0.1, 0.0, 0.8]
+    poses = np.array([stands @ axis.turn(a) for a in rng.uniform(-1, 1, 6)])
+    found = _stood(poses, _Frames([[0, 1, 2], [3], [4, 5]], np.array([1, 3, 4]), np.zeros((0, 2), int)), axis, 0)
+    np.testing.assert_allclose(found[0], poses[0], atol=1e-12)
+    np.testing.assert_allclose(found[1:3], found[[0, 0]], atol=1e-12)
+    np.testing.assert_allclose(found[4], found[5], atol=1e-12)
+    # how the runs lie to each other stays
+    np.testing.assert_allclose(found[1] @ np.linalg.inv(found[3]), poses[1] @ np.linalg.inv(poses[3]), atol=1e-12)
 
 
 def test_looks_that_fit_no_turns_better_than_random_ones_are_not_believed() -> None:
