@@ -40,7 +40,9 @@ class RollConfig:
     lowest: float = 0.1
     """So large a share of them may be lower than they are."""
     sunk_m: float = 0.002
-    """That far below the body's own lowest point is sunk, with this standard deviation."""
+    """That far below the table is sunk, with this standard deviation; ..."""
+    pose_share: float = 0.5
+    """... where the body itself seems in it, so much of that is its pose's error (and the rest its profile's)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,7 +142,8 @@ def sunk(
             along, radius, angle = parts[i]
             around = angle[:, None] + sign * turns_rad
             height = foot + (along * rise)[:, None] + radius[:, None] * (x * np.cos(around) + y * np.sin(around))
-            deep = min(low[j], 0.0) - config.sunk_m - np.quantile(height, config.lowest, axis=0)
+            allowed = config.pose_share * min(low[j], 0.0) - config.sunk_m
+            deep = allowed - np.quantile(height, config.lowest, axis=0)
             out[m] += 0.5 * (np.maximum(deep, 0.0) / config.sunk_m) ** 2
     return out
 
