@@ -198,7 +198,7 @@ def _second_track(run: Run, toss: int, drawn: Done, shape: Done, masks: Done) ->
         return {"frames": len(frames), "lost": int(tracked.track.lost.sum())}
 
     config = {"track": run.matcher_settings(run.config.track), "start": run.config.cycle.start}
-    return run.store.run("track", 6, config, inputs, compute)
+    return run.store.run("track", 7, config, inputs, compute)
 
 
 def second_field(

@@ -121,9 +121,12 @@ def write_hand(folder: Path, toss: int, camera_from_hand: Float[Array, "n 4 4"])
 
 
 def read_hand(folder: Path, toss: int) -> Float[Array, "n 4 4"] | None:
-    """What `write_hand` wrote; None where no robot is known."""
+    """What `write_hand` wrote; None where no robot is known. Raises BadInput where it cannot be read."""
     path = folder / f"{_stem(toss)}.hand.npy"
-    return np.load(path, allow_pickle=False) if path.exists() else None
+    try:
+        return np.load(path, allow_pickle=False) if path.exists() else None
+    except (OSError, ValueError, EOFError) as wrong:
+        raise BadInput(f"{path} holds no poses of the hand ({wrong}); remove {folder} and run again") from wrong
 
 
 class Masks(Sequence[Bool[Array, "h w"]]):

@@ -226,8 +226,7 @@ def _add_motion(
     """Adds the pull towards constant spin and ballistic centre over each three views in a row; impacts are outliers
     (`_believed`). The residuals are changes of spin (rad/s) and of velocity (m/s), camera axes."""
     index = np.flatnonzero(use)
-    _add_still(H, g, poses, index, place, motion, config)
-    _add_carried(H, g, poses, index, place, motion, config)
+    _add_ties(H, g, poses, index, place, motion, config)
     if config.jerk_rad_s is not None:
         _add_smooth(H, g, poses, index, place, motion, config.jerk_rad_s)
     for a, b, c in zip(index, index[1:], index[2:]):
@@ -276,36 +275,23 @@ def _believed(normalised: Float[Array, " d"]) -> float:
     return float(1.0 / (1.0 + normalised @ normalised / 4.0) ** 2)
 
 
-def _add_still(
+def _add_ties(
     H: Float[Array, "f f 6 6"], g: Float[Array, "f 6"], poses: Float[Array, "n 4 4"], index: Int[Array, " m"],
     place: Int[Array, " n"], motion: Motion, config: GraphConfig,
 ) -> None:  # fmt: skip
-    """Ties poses between which the object stands still; robustly (Cauchy), because a slow start looks still."""
-    information = np.array([config.still_m**-2] * 3 + [config.still_rad**-2] * 3)
-    for a, b in zip(index, index[1:]):
-        if motion.toss[a] != motion.toss[b] or not motion.still[b]:
+    """Ties each pose to the one before it where the object stands still (robustly: Cauchy, because a slow start looks
+    still), or moves as the robot's hand does (Huber: it may slip, but stays in the hand)."""
+    still = np.array([config.still_m**-2] * 3 + [config.still_rad**-2] * 3)
+    carried = np.array([config.carried_m**-2] * 3 + [config.carried_rad**-2] * 3)
+    for a, b in zip(map(int, index), map(int, index[1:])):
+        if motion.toss[a] == motion.toss[b] and motion.still[b]:
+            residual = _gap(poses[a], poses[b])
+            weight = still / (1.0 + residual @ (still * residual) / 9.0)
+        elif is_held(poses, a, b, motion, config):
+            residual = _gap(motion.carried[a, b] @ poses[a], poses[b])
+            weight = carried / max(np.sqrt(residual @ (carried * residual)) / 3.0, 1.0)
+        else:
             continue
-        residual = _gap(poses[a], poses[b])
-        _tie(
-            H,
-            g,
-            (int(place[a]), int(place[b])),
-            residual,
-            information / (1.0 + residual @ (information * residual) / 9.0),
-        )
-
-
-def _add_carried(
-    H: Float[Array, "f f 6 6"], g: Float[Array, "f 6"], poses: Float[Array, "n 4 4"], index: Int[Array, " m"],
-    place: Int[Array, " n"], motion: Motion, config: GraphConfig,
-) -> None:  # fmt: skip
-    """Ties each pose to the one before it as the robot's hand moved (robustly: Huber), where it holds the body."""
-    information = np.array([config.carried_m**-2] * 3 + [config.carried_rad**-2] * 3)
-    for a, b in zip(index, index[1:]):
-        if motion.still[b] or not is_held(poses, int(a), int(b), motion, config):
-            continue
-        residual = _gap(motion.carried[int(a), int(b)] @ poses[a], poses[b])
-        weight = information / max(np.sqrt(residual @ (information * residual)) / 3.0, 1.0)
         _tie(H, g, (int(place[a]), int(place[b])), residual, weight)
 
 

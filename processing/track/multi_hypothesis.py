@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from numpy import ndarray as Array
 
 from processing.track.beam import Scene
@@ -34,13 +34,8 @@ def write_toss_track(folder: Path, tracked: TossTrack) -> None:
             center_m=tracked.center_m,
             margin=np.array(tracked.margin),
             round_body=np.array(tracked.round_body),
-            held=np.array([(n, i) for n, run in enumerate(tracked.held) for i in run], dtype=np.int64).reshape(-1, 2),
+            held=tracked.held,
         )
-
-
-def _runs(numbered: Int[Array, "m 2"]) -> tuple[tuple[int, ...], ...]:
-    """Frames (second column) by the number of their run."""
-    return tuple(tuple(map(int, numbered[numbered[:, 0] == n, 1])) for n in np.unique(numbered[:, 0]))
 
 
 def read_toss_track(
@@ -70,7 +65,7 @@ def read_toss_track(
                 margin=float(stored["margin"]),
                 store=store,
                 round_body=bool(stored["round_body"]),
-                held=_runs(stored["held"]),
+                held=stored["held"],
             )
     except (OSError, KeyError, ValueError) as wrong:
         raise BadInput(

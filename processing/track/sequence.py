@@ -69,18 +69,15 @@ class TossTrack:
     margin: float
     """How much worse the best different story fits (infinite: there is none)."""
     store: ViewStore
+    held: Int[Array, " n"]
+    """Frames with the same number are a run through which a robot's hand carries the body; -1: none does."""
     round_body: bool = False
     """Whether the body is round and its turn was found from all frames at once: pairs of views alone would spoil it."""
-    held: tuple[tuple[int, ...], ...] = ()
-    """Frames in a row through which a robot's hand carries the body: how they lie to each other is known."""
 
     @property
     def tied(self) -> Int[Array, " n"]:
-        """Frames with the same number lie to each other as they do; -1: no others."""
-        out = np.full(len(self.cost), 0 if self.round_body else -1)
-        for n, run in enumerate(() if self.round_body else self.held):
-            out[list(run)] = n
-        return out
+        """Frames with the same number lie to each other as they do; -1: to no others."""
+        return np.zeros_like(self.held) if self.round_body else self.held
 
     @property
     def unfit(self) -> int:
@@ -137,6 +134,8 @@ def track_toss(
     Raises BadInput where no frame shows enough of the object, or where what is given does not fit together.
     """
     config, progress = config or TrackConfig(), progress or Silent()
+    if hand is not None and hand.shape != (len(frames), 4, 4):
+        raise BadInput(f"a hand of shape {hand.shape} for {len(frames)} frames; wanted a 4x4 pose per frame, or NaN")
     sure = np.ones(len(frames)) if confidence is None else np.asarray(confidence, dtype=np.float64)
     store, times_s, drawn = views_of(
         frames, masks, camera, sure, config, world_from_camera, progress, colorless=colorless, model=model
@@ -368,4 +367,4 @@ def _told(
         if apart_deg(joint.poses[:n], other.joint.poses[:n]) > config.story.agreeing_deg:
             margin = min(margin, other.total - best.total)
     return TossTrack(track, cost, on, keyframes, pairs, rejected, best.center_m, margin, scene.store,
-                     best.axis is not None, best.held)  # fmt: skip
+                     best.held, best.axis is not None)  # fmt: skip

@@ -42,10 +42,10 @@ class SteadyConfig:
     flight_m_s: float = 0.15
     """A change of velocity, beyond gravity's, below this is free flight."""
     roll: RollConfig = field(default_factory=RollConfig)
-    carried_rad: float = 0.05
-    carried_m: float = 0.006
+    held_rad: float = 0.05
+    held_m: float = 0.006
     """From view to view, an axis that moves as the robot's hand does within these is carried ..."""
-    slips_rad: float = 0.004
+    carried_rad: float = 0.004
     """... and turns in it by no more than this (standard deviation)."""
 
 
@@ -95,11 +95,11 @@ def _carried(scene: Scene, views: Int[Array, " v"], body: Grounded, told: Told, 
             continue
         pose = moved @ body.poses[n]
         off = (pose - body.poses[n + 1])[:3]
-        if np.linalg.norm(off[:, :3] @ body.axis.direction) > config.carried_rad:
+        if np.linalg.norm(off[:, :3] @ body.axis.direction) > config.held_rad:
             continue
-        if np.linalg.norm(off[:, :3] @ middle + off[:, 3]) < config.carried_m:
+        if np.linalg.norm(off[:, :3] @ middle + off[:, 3]) < config.held_m:
             turn[n] = rotation_log(pose[:3, :3].T @ body.poses[n, :3, :3]) @ body.axis.direction
-            sigma[n] = config.slips_rad
+            sigma[n] = config.carried_rad
     return Told(turn, sigma)
 
 

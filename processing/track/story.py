@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from numpy import ndarray as Array
 
 from processing.track.beam import LEAST_DELAY_S, Hypothesis, Scene
@@ -57,11 +57,11 @@ class Story:
     center_m: Float[Array, "3"]
     motion: Motion
     badness: float
+    held: Int[Array, " n"]
+    """Frames with the same number are a run through which a robot's hand carries the body; -1: none does."""
     turned: Turned | None = None
     axis: Axis | None = None
     """Of a round body, all of whose views were laid onto one profile."""
-    held: tuple[tuple[int, ...], ...] = ()
-    """Frames in a row through which the robot's hand carries it."""
     against: float = 0.0
     """What the looks say against it, beside the story that fits best, in units of badness."""
 
@@ -206,7 +206,7 @@ def refined(
     fit = np.nanmean(per_view(joint.pairs, joint.figures, all_views)[0][:n]) if len(joint.pairs) else 0.0
     price = mean_price(joint.poses[:n], use, scene, center_m, config.motion)
     runs = _held(joint.poses, use, motion, config.graph)
-    return Story(best, use, fixed, joint, center_m, motion, float(fit + price), axis=axis, held=runs)
+    return Story(best, use, fixed, joint, center_m, motion, float(fit + price), runs, axis=axis)
 
 
 def _carried(scene: Scene, use: Bool[Array, " n"]) -> dict[tuple[int, int], Float[Array, "4 4"]]:
@@ -217,17 +217,13 @@ def _carried(scene: Scene, use: Bool[Array, " n"]) -> dict[tuple[int, int], Floa
 
 def _held(
     poses: Float[Array, "v 4 4"], use: Bool[Array, " n"], motion: Motion, config: GraphConfig
-) -> tuple[tuple[int, ...], ...]:
-    """Frames in a row through which the robot's hand carries the body."""
-    runs: list[list[int]] = []
+) -> Int[Array, " n"]:
+    """Runs of frames through which the robot's hand carries the body, numbered; -1 elsewhere."""
+    out = np.full(len(use), -1)
     for a, b in pairwise(map(int, np.flatnonzero(use))):
-        if not is_held(poses, a, b, motion, config):
-            continue
-        if runs and runs[-1][-1] == a:
-            runs[-1].append(b)
-        else:
-            runs.append([a, b])
-    return tuple(map(tuple, runs))
+        if is_held(poses, a, b, motion, config):
+            out[a] = out[b] = out[a] if out[a] >= 0 else out.max() + 1
+    return out
 
 
 def mean_price(

@@ -104,6 +104,9 @@ def test_the_robots_hand_comes_back(tmp_path: Path) -> None:
     write_hand(tmp_path, 4, hand)
     np.testing.assert_array_equal(read_hand(tmp_path, 4), hand)
     assert read_hand(tmp_path, 5) is None
+    (tmp_path / "toss_05.hand.npy").write_bytes((tmp_path / "toss_04.hand.npy").read_bytes()[:200])
+    with pytest.raises(BadInput, match="no poses of the hand"):
+        read_hand(tmp_path, 5)
 
 
 def test_a_contact_model_comes_back(tmp_path: Path) -> None:

@@ -293,6 +293,8 @@ def test_frames_without_the_object_are_refused_in_words(tiny_world: Any, toss: A
         followed(tiny_world, ([], []))
     with pytest.raises(BadInput, match="10 frames, 9 masks"):
         followed(tiny_world, (toss[0], toss[1][:9]))
+    with pytest.raises(BadInput, match=r"a hand of shape \(9, 4, 4\) for 10 frames"):
+        followed(tiny_world, toss, hand=toss[2][:9])
 
 
 def test_a_lens_makes_no_difference() -> None:
