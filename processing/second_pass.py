@@ -159,7 +159,7 @@ def second_tracks(run: Run, name: str, drawn: Done, shape: Done, masks: Mapping[
         return {"fit": [round(float(f), 4) for f in together.fit]}
 
     config = {"register": run.matcher_settings(run.config.register), "together": True}
-    return {**tracks, **dict.fromkeys(seen, run.store.run("register", 3, config, inputs, compute))}
+    return {**tracks, **dict.fromkeys(seen, run.store.run("register", 4, config, inputs, compute))}
 
 
 def _second_track(run: Run, toss: int, drawn: Done, shape: Done, masks: Done) -> Done:
@@ -198,7 +198,7 @@ def _second_track(run: Run, toss: int, drawn: Done, shape: Done, masks: Done) ->
         return {"frames": len(frames), "lost": int(tracked.track.lost.sum())}
 
     config = {"track": run.matcher_settings(run.config.track), "start": run.config.cycle.start}
-    return run.store.run("track", 7, config, inputs, compute)
+    return run.store.run("track", 8, config, inputs, compute)
 
 
 def second_field(

@@ -55,7 +55,7 @@ def track_stage(run: Run, toss: int, masks: Done) -> Done:
         write_notes(folder, toss, *notes_of(tracked, run.matcher))
         return {**_count(tracked.track), "unfit": tracked.unfit}
 
-    return run.store.run("track", 8, run.matcher_settings(run.config.track), inputs, compute)
+    return run.store.run("track", 9, run.matcher_settings(run.config.track), inputs, compute)
 
 
 def model_stage(run: Run, model: Path) -> Done:
@@ -95,7 +95,7 @@ def model_track_stage(run: Run, toss: int, masks: Done, model: Done) -> Done:
         write_notes(folder, toss, *notes_of(tracked, run.matcher))
         return {**_count(tracked.track), "unfit": tracked.unfit}
 
-    return run.store.run("track", 8, run.matcher_settings(run.config.track), inputs, compute)
+    return run.store.run("track", 9, run.matcher_settings(run.config.track), inputs, compute)
 
 
 def register_stage(run: Run, tracks: dict[int, Done], masks: dict[int, Done]) -> Done:
@@ -128,7 +128,7 @@ def register_stage(run: Run, tracks: dict[int, Done], masks: dict[int, Done]) ->
             write_track(folder, replace(kept, object_frame="object"))
         return {**counts, "fit": [round(float(f), 4) if np.isfinite(f) else None for f in together.fit]}
 
-    return run.store.run("register", 4, run.matcher_settings(run.config.register), inputs, compute)
+    return run.store.run("register", 5, run.matcher_settings(run.config.register), inputs, compute)
 
 
 def field_stage(run: Run, name: str, tracks: dict[int, Done], masks: dict[int, Done]) -> Done:

@@ -18,9 +18,10 @@ from numpy import ndarray as Array
 from processing.track import contradiction_kernels as c
 from processing.track import kernels as k
 from processing.track.beam import Schedule, rows
+from processing.track.graph import add_pairs
 from processing.track.keyframes import view_directions
 from processing.track.motion import all_turns
-from processing.track.pool import Sides, far_apart
+from processing.track.pool import Pool, Sides, far_apart
 from processing.track.propose import Fit, distinct, stepped
 from processing.track.views import ViewStore
 
@@ -38,6 +39,8 @@ class ContradictionConfig:
     """The scales at which a placement is judged: so much is a clear contradiction by a third."""
     rim_share: float = 0.25
     """What a contradicted point of the rim counts, against one of the surface."""
+    joint_share: float = 0.05
+    """What contradictions count in a refinement of all poses, against pairs that see the same side, which err less."""
     turns: int = 216
     """Turns tried all around ..."""
     seek_views: int = 5
@@ -143,17 +146,31 @@ class Opposed:
         gap = (looks[0] - looks[1]) / self.config.judged[0][k.INTENSITY]
         return float(np.minimum(gap**2 / 9, 1.0).mean())
 
-    def aligned(self, common_from_own: Float[Array, "4 4"], schedule: Schedule) -> Float[Array, "4 4"]:
+    def aligned(
+        self, common_from_own: Float[Array, "4 4"], schedule: Schedule, *, grounded: bool = False
+    ) -> Float[Array, "4 4"]:
         """Gauss-Newton over all pairs of views of the two sides: nothing beside an outline, nothing before a surface,
-        and the surfaces that both see together."""
+        and the surfaces that both see together; `grounded`: what one stands on is where the table was."""
         distance_m = float(np.median(np.linalg.norm(self.both.pool.store.center_m[self.both.mine], axis=1)))
         pairs = self.pairs
+        together = len(pairs) / (len(self.both.mine) + len(self.both.theirs))  # a view's pairs share its errors
         sign = np.where(np.isin(pairs[:, 0], self.both.mine), 1.0, -1.0)[:, None]
         for row in rows(schedule, distance_m):
             for _ in range(int(row[k.STEPS])):
-                blocks, gradients, _ = self._terms(self.both.poses(common_from_own), pairs, row)
-                common_from_own = stepped(common_from_own, blocks.sum(0), (sign * gradients).sum(0))
+                poses = self.both.poses(common_from_own)
+                blocks, gradients, _ = self._terms(poses, pairs, row)
+                H, g = blocks.sum(0) / together, (sign * gradients).sum(0) / together
+                if grounded:
+                    self._add_ground(H, g, poses)
+                common_from_own = stepped(common_from_own, H, g)
         return common_from_own
+
+    def _add_ground(self, H: Float[Array, "6 6"], g: Float[Array, "6"], poses: Float[Array, "n 4 4"]) -> None:
+        both = self.both
+        place = np.full(len(poses), -1)
+        place[both.mine] = 0
+        views = np.concatenate([both.mine, both.theirs])
+        replace(both.pool.footing, views=views).add(H[None, None], g[None], poses, place)
 
     def cost(self, common_from_own: Float[Array, "4 4"]) -> float:
         """What speaks against a placement, mean over the points: near 0 (or below) for the right one, where the two
@@ -175,7 +192,11 @@ class Opposed:
         """Placements aligned and judged, different ones only, best first."""
         coarse = [self.aligned(f.first_from_own, self.config.coarse) for f in found]
         rough = distinct([Fit(x, self.cost(x)) for x in coarse])[: self.config.kept]
-        fine = [self.aligned(f.first_from_own, self.config.fine) for f in rough]
+        return self.judged(rough)
+
+    def judged(self, found: list[Fit]) -> list[Fit]:
+        """Placements that are nearly right aligned finely and judged, best first."""
+        fine = [self.aligned(f.first_from_own, self.config.fine, grounded=True) for f in found]
         return distinct([Fit(x, self.cost(x)) for x in fine])
 
     def all_around(self) -> list[Fit]:
@@ -205,20 +226,55 @@ class Opposed:
     def _terms(
         self, poses: Float[Array, "n 4 4"], pairs: Int[Array, "m 2"], row: Float[Array, "7"]
     ) -> tuple[Float[Array, "m 6 6"], Float[Array, "m 6"], Float[Array, " f"]]:
-        """Normal equations of each pair, surface and rim together; figures summed over pairs, the rim's last."""
-        store, n = self.both.pool.store, len(pairs)
-        blocks, gradients, total = np.zeros((n, 6, 6)), np.zeros((n, 6)), []
-        views = np.ascontiguousarray(store.table[:, k.FIRST]), np.ascontiguousarray(store.table[:, k.COUNT])
-        for points, first, count, rim in (
-            (store.samples, *views, False),
-            (self.rims.points_m, self.rims.first, self.rims.count, True),
-        ):
-            H, g, figures = np.zeros((n, 6, 6)), np.zeros((n, 6)), np.zeros((n, c.FIGURES))
-            c.contradictions(poses, pairs, store.maps, points, first, count, store.table, store.optics.focal,
-                             store.optics.center, row, rim, H, g, figures)  # fmt: skip
-            blocks, gradients = blocks + H, gradients + g
-            total.append(figures.sum(0))
-        return blocks, gradients, np.concatenate(total)
+        return _compared(self.both.pool.store, self.rims, poses, pairs, row)
+
+
+@dataclass(frozen=True, eq=False)
+class Contradictions:
+    """What views of different tosses contradict each other, for a refinement of all poses at once (graph.py)."""
+
+    store: ViewStore
+    rims: Rims
+    pairs: Int[Array, "m 2"]
+    row: Float[Array, "7"]
+    weight: float
+    """Of each pair: those of a view share its errors."""
+
+    @staticmethod
+    def of(pool: Pool, rims: Rims, use: Bool[Array, " n"], config: ContradictionConfig) -> Contradictions:
+        """Between all used views of different tosses."""
+        views = np.flatnonzero(use)
+        pairs = [(int(i), int(j)) for i in views for j in views if pool.toss[i] != pool.toss[j]]
+        distance_m = float(np.median(np.linalg.norm(pool.store.center_m[use], axis=1)))
+        row = rows(config.fine, distance_m)[-1]
+        return Contradictions(pool.store, rims, np.array(pairs, dtype=np.int64).reshape(-1, 2), row,
+                              config.joint_share * len(views) / max(len(pairs), 1))  # fmt: skip
+
+    def add(
+        self, H: Float[Array, "f f 6 6"], g: Float[Array, "f 6"], poses: Float[Array, "n 4 4"], place: Int[Array, " n"]
+    ) -> None:
+        """Adds to normal equations (`graph.add_pairs`)."""
+        blocks, gradients, _ = _compared(self.store, self.rims, poses, self.pairs, self.row)
+        add_pairs(H, g, self.weight * blocks, self.weight * gradients, place[self.pairs])
+
+
+def _compared(
+    store: ViewStore, rims: Rims, poses: Float[Array, "n 4 4"], pairs: Int[Array, "m 2"], row: Float[Array, "7"]
+) -> tuple[Float[Array, "m 6 6"], Float[Array, "m 6"], Float[Array, " f"]]:
+    """Normal equations of each pair, surface and rim together; figures summed over pairs, the rim's last."""
+    n = len(pairs)
+    blocks, gradients, total = np.zeros((n, 6, 6)), np.zeros((n, 6)), []
+    views = np.ascontiguousarray(store.table[:, k.FIRST]), np.ascontiguousarray(store.table[:, k.COUNT])
+    for points, first, count, rim in (
+        (store.samples, *views, False),
+        (rims.points_m, rims.first, rims.count, True),
+    ):
+        H, g, figures = np.zeros((n, 6, 6)), np.zeros((n, 6)), np.zeros((n, c.FIGURES))
+        c.contradictions(poses, pairs, store.maps, points, first, count, store.table, store.optics.focal,
+                         store.optics.center, row, rim, H, g, figures)  # fmt: skip
+        blocks, gradients = blocks + H, gradients + g
+        total.append(figures.sum(0))
+    return blocks, gradients, np.concatenate(total)
 
 
 def _some(views: Int[Array, " a"], count: int) -> Int[Array, " b"]:

@@ -7,8 +7,9 @@ loop without a feature match; a weak pull towards free flight holds what the ima
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -18,7 +19,6 @@ from processing.track import kernels as k
 from processing.track.beam import Schedule, rows
 from processing.track.keyframes import view_directions
 from processing.track.motion import turn_between
-from processing.track.round_body import RoundBody
 from processing.track.views import ViewStore
 from recordings.geometry import rotation_log, skew
 
@@ -79,6 +79,17 @@ def round_views() -> GraphConfig:
     """Settings for views that a round body's profile ties already: pairs of them, which drift, count little."""
     fine = ((1, 2, 0.006, 0.4, 0.008, 0.3), (0, 4, 0.003, 0.15, 0.005, 0.3), (0, 6, 0.0035, 0.08, 0.005, 0.3))
     return GraphConfig(round_body=True, shared_noise=100.0, schedule=fine)
+
+
+@runtime_checkable
+class Terms(Protocol):
+    """What else is known of poses."""
+
+    def add(
+        self, H: Float[Array, "f f 6 6"], g: Float[Array, "f 6"], poses: Float[Array, "n 4 4"], place: Int[Array, " n"]
+    ) -> None:
+        """Adds to normal equations for the twists of the object frame per unknown; `place`: that of each view, -1
+        where it is fixed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,12 +156,12 @@ def refine(
     motion: Motion,
     config: GraphConfig,
     held: Float[Array, "6"] | None = None,
-    body: RoundBody | None = None,
     tied: Int[Array, " n"] | None = None,
+    beside: Sequence[Terms] = (),
 ) -> Refined:
     """All poses in `use` at once; those in `fixed` stay. `poses` of other views are returned as they are. No pose moves
-    along the twist `held`, where there is one. A round body's profile is solved with them. Views with the
-    same number in `tied` move as one (not at all with a fixed one); those with -1 move alone."""
+    along the twist `held`, where there is one. Views with the same number in `tied` move as one (not at all with a
+    fixed one); those with -1 move alone. `beside`: what else is known of the poses."""
     poses = poses.copy()
     free = use & ~fixed
     place = np.where(free, np.cumsum(free) - 1, -1)
@@ -163,7 +174,7 @@ def refine(
     H = np.eye(6 * (int(place.max(initial=-1)) + 1))
     for row in rows(config.schedule, distance, config.round_body):
         for _ in range(int(row[k.STEPS])):
-            H, g, figures = _normal_equations(store, poses, use, pairs, place, row, motion, config, body)
+            H, g, figures = _normal_equations(store, poses, use, pairs, place, row, motion, config, beside)
             if held is not None:
                 _hold(H, held)
             step = -np.linalg.solve(H + np.diag(1e-6 * np.diag(H) + 1e-9), g).reshape(-1, 6)
@@ -194,7 +205,8 @@ def _hold(H: Float[Array, "f f"], held: Float[Array, "6"]) -> None:
 
 def _normal_equations(
     store: ViewStore, poses: Float[Array, "n 4 4"], use: Bool[Array, " n"], pairs: Int[Array, "m 2"],
-    place: Int[Array, " n"], row: Float[Array, "7"], motion: Motion, config: GraphConfig, body: RoundBody | None,
+    place: Int[Array, " n"], row: Float[Array, "7"], motion: Motion, config: GraphConfig,
+    beside: Sequence[Terms],
 ) -> tuple[Float[Array, "f f"], Float[Array, " f"], Float[Array, "m 3"]]:  # fmt: skip
     count = int(place.max()) + 1
     blocks, gradients = np.zeros((len(pairs), 6, 6)), np.zeros((len(pairs), 6))
@@ -207,16 +219,25 @@ def _normal_equations(
     blocks *= weight[:, None, None]
     gradients *= weight[:, None]
     H, g = np.zeros((count, count, 6, 6)), np.zeros((count, 6))
-    i, j = place[pairs[:, 0]], place[pairs[:, 1]]
+    add_pairs(H, g, blocks, gradients, place[pairs])
+    _add_motion(H, g, poses, use, place, motion, config)
+    for terms in beside:
+        terms.add(H, g, poses, place)
+    return H.transpose(0, 2, 1, 3).reshape(6 * count, 6 * count), g.reshape(-1), figures
+
+
+def add_pairs(
+    H: Float[Array, "f f 6 6"], g: Float[Array, "f 6"], blocks: Float[Array, "m 6 6"], gradients: Float[Array, "m 6"],
+    places: Int[Array, "m 2"],
+) -> None:  # fmt: skip
+    """Adds terms of pairs of views, given for the twist of each one's first, to normal equations; `places`: each
+    view's unknown, -1 where it is fixed."""
+    i, j = places[:, 0], places[:, 1]
     for a, b, sign in ((i, i, 1), (j, j, 1), (i, j, -1), (j, i, -1)):
         ok = (a >= 0) & (b >= 0)
         np.add.at(H, (a[ok], b[ok]), sign * blocks[ok])
     np.add.at(g, i[i >= 0], gradients[i >= 0])
     np.add.at(g, j[j >= 0], -gradients[j >= 0])
-    _add_motion(H, g, poses, use, place, motion, config)
-    if body is not None:
-        body.add(H, g, poses, place)
-    return H.transpose(0, 2, 1, 3).reshape(6 * count, 6 * count), g.reshape(-1), figures
 
 
 def _add_motion(
@@ -359,25 +380,3 @@ def _covariances(H: Float[Array, "d d"], place: Int[Array, " n"]) -> Float[Array
         a = 6 * place[i]
         out[i] = inverse[a : a + 6, a : a + 6]
     return out
-
-
-def flight_center(
-    poses: Float[Array, "n 4 4"], times_s: Float[Array, " n"], gravity_camera_m_s2: Float[Array, "3"],
-    flying: Int[Array, " m"], guess_m: Float[Array, "3"], sigma_m: float = 0.03,
-) -> Float[Array, "3"]:  # fmt: skip
-    """Centre of mass (object frame) from views in free flight: R_i c + t_i = p + v t + g t^2 / 2, least squares for
-    c, p, v, held to `guess_m` with `sigma_m`. The guess where there are too few views."""
-    if len(flying) < 5:
-        return guess_m
-    t = times_s[flying] - times_s[flying[0]]
-    m = len(flying)
-    A = np.zeros((3 * m + 3, 9))
-    b = np.zeros(3 * m + 3)
-    for n, i in enumerate(flying):
-        A[3 * n : 3 * n + 3, :3] = poses[i, :3, :3]
-        A[3 * n : 3 * n + 3, 3:6] = -np.eye(3)
-        A[3 * n : 3 * n + 3, 6:] = -t[n] * np.eye(3)
-        b[3 * n : 3 * n + 3] = 0.5 * gravity_camera_m_s2 * t[n] ** 2 - poses[i, :3, 3]
-    fit_m = 0.002
-    A[-3:, :3], b[-3:] = fit_m / sigma_m * np.eye(3), fit_m / sigma_m * guess_m
-    return np.asarray(np.linalg.lstsq(A, b, rcond=None)[0][:3])

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from numpy import ndarray as Array
 
 from processing.track.beam import Scene
-from processing.track.graph import Motion, flight_center, motion_residual
+from processing.track.graph import Motion, motion_residual
 
 
 def center_of_mass(poses: Float[Array, "n 4 4"], use: Bool[Array, " n"], scene: Scene) -> Float[Array, "3"]:
@@ -28,6 +28,28 @@ def center_of_mass(poses: Float[Array, "n 4 4"], use: Bool[Array, " n"], scene: 
     run = _longest_run(free)
     flying = index[run.start : run.stop + 2] if run.stop > run.start else index[:0]
     return flight_center(poses, scene.times_s, scene.gravity_camera_m_s2, flying, scene.center_m)
+
+
+def flight_center(
+    poses: Float[Array, "n 4 4"], times_s: Float[Array, " n"], gravity_camera_m_s2: Float[Array, "3"],
+    flying: Int[Array, " m"], guess_m: Float[Array, "3"], sigma_m: float = 0.03,
+) -> Float[Array, "3"]:  # fmt: skip
+    """Centre of mass (object frame) from views in free flight: R_i c + t_i = p + v t + g t^2 / 2, least squares for
+    c, p, v, held to `guess_m` with `sigma_m`. The guess where there are too few views."""
+    if len(flying) < 5:
+        return guess_m
+    t = times_s[flying] - times_s[flying[0]]
+    m = len(flying)
+    A = np.zeros((3 * m + 3, 9))
+    b = np.zeros(3 * m + 3)
+    for n, i in enumerate(flying):
+        A[3 * n : 3 * n + 3, :3] = poses[i, :3, :3]
+        A[3 * n : 3 * n + 3, 3:6] = -np.eye(3)
+        A[3 * n : 3 * n + 3, 6:] = -t[n] * np.eye(3)
+        b[3 * n : 3 * n + 3] = 0.5 * gravity_camera_m_s2 * t[n] ** 2 - poses[i, :3, 3]
+    fit_m = 0.002
+    A[-3:, :3], b[-3:] = fit_m / sigma_m * np.eye(3), fit_m / sigma_m * guess_m
+    return np.asarray(np.linalg.lstsq(A, b, rcond=None)[0][:3])
 
 
 def _longest_run(flags: list[bool]) -> range:

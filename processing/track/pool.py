@@ -10,6 +10,7 @@ from jaxtyping import Float, Int
 from numpy import ndarray as Array
 
 from processing.track import kernels as k
+from processing.track.footing import Footing, FootingConfig, footing
 from processing.track.keyframes import view_directions
 from processing.track.known_shape import ShapeConfig, middle_of, shape_views
 from processing.track.sequence import TossTrack
@@ -26,6 +27,7 @@ class Pool:
     toss: Int[Array, " n"]
     frame: Int[Array, " n"]
     center_m: Float[Array, "3"]
+    footing: Footing
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,9 +51,12 @@ class Sides:
         return _middle(self.pool.store, self.mine, self.pool.poses), _middle(self.pool.store, self.theirs, self.common)
 
 
-def pooled(tosses: Sequence[TossTrack], model: ObjectShape | None, keyframes: int, shape: ShapeConfig) -> Pool:
-    """The tosses' keyframes; after them the drawn views of a learned shape, as if they were one more toss."""
-    chosen = [_spread(t, keyframes) for t in tosses]
+def pooled(
+    tosses: Sequence[TossTrack], model: ObjectShape | None, keyframes: Sequence[int], shape: ShapeConfig,
+    ground: FootingConfig,
+) -> Pool:  # fmt: skip
+    """So many keyframes of each toss; after them the drawn views of a learned shape, as if they were one more toss."""
+    chosen = [_spread(t, count) for t, count in zip(tosses, keyframes)]
     stores = [t.store.only(c) for t, c in zip(tosses, chosen)]
     poses = [t.track.camera_from_object[c] for t, c in zip(tosses, chosen)]
     center_m = tosses[0].center_m
@@ -64,7 +69,22 @@ def pooled(tosses: Sequence[TossTrack], model: ObjectShape | None, keyframes: in
         chosen.append(np.arange(len(drawn.crops)))
         center_m = middle_of(model)
     whose = np.concatenate([np.full(len(c), i) for i, c in enumerate(chosen)])
-    return Pool(ViewStore.joined(stores), np.concatenate(poses), whose, np.concatenate(chosen), center_m)
+    store, frame = ViewStore.joined(stores), np.concatenate(chosen)
+    return Pool(store, np.concatenate(poses), whose, frame, center_m, _footing(tosses, store, whose, frame, ground))
+
+
+def _footing(
+    tosses: Sequence[TossTrack], store: ViewStore, whose: Int[Array, " n"], frame: Int[Array, " n"],
+    config: FootingConfig,
+) -> Footing:  # fmt: skip
+    """Where the keyframes stand on the table (a learned shape's views do not)."""
+    out = Footing(store, np.arange(len(store)), np.full(len(store), -1), np.full((len(store), 4), np.nan), config)
+    for n, toss in enumerate(tosses):
+        own, mine = footing(toss.store, toss.track.camera_from_object, _usable(toss), config), whose == n
+        stand = own.stand[frame[mine]]
+        out.stand[mine] = np.where(stand >= 0, len(tosses) * stand + n, -1)
+        out.planes[mine] = own.planes[frame[mine]]
+    return out
 
 
 def sides(pool: Pool, toss: int, joined: Int[Array, " j"], first_from_own: Float[Array, "t 4 4"]) -> Sides:
@@ -89,9 +109,9 @@ def far_apart(directions: Float[Array, "n 3"], count: int) -> Int[Array, " m"]:
 def _spread(toss: TossTrack, count: int) -> Int[Array, " m"]:
     """Well fitting keyframes, each as far as possible in direction from those before (the first and last included)."""
     poses = toss.track.camera_from_object
-    usable = np.array([i for i in range(len(poses)) if toss.track.status[i] == "tracked" and toss.store.usable(i)])
+    usable = _usable(toss)
     if len(usable) == 0:
-        return np.zeros(0, dtype=np.int64)
+        return usable
     directions = view_directions(poses[usable], toss.center_m)
     cost = np.nan_to_num(toss.cost[usable], nan=0.3)
     chosen = [0]
@@ -101,6 +121,12 @@ def _spread(toss: TossTrack, count: int) -> Int[Array, " m"]:
         gain[chosen] = -np.inf
         chosen.append(int(gain.argmax()))
     return np.sort(usable[chosen])
+
+
+def _usable(toss: TossTrack) -> Int[Array, " m"]:
+    """Tracked frames with something to see."""
+    status = toss.track.status
+    return np.array([i for i in range(len(status)) if status[i] == "tracked" and toss.store.usable(i)], dtype=np.int64)
 
 
 def _middle(store: ViewStore, views: Int[Array, " a"], poses: Float[Array, "n 4 4"]) -> Float[Array, "3"]:

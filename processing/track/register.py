@@ -9,15 +9,16 @@ taken. A toss that is contradicted everywhere is left out and said to be.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray as Array
 
-from processing.track.contradiction import ContradictionConfig, Opposed, Rims
+from processing.track.contradiction import ContradictionConfig, Contradictions, Opposed, Rims
 from processing.track.features import FeatureMatcher, Features, Sift
+from processing.track.footing import FootingConfig
 from processing.track.graph import GraphConfig, Motion, refine
 from processing.track.known_shape import ShapeConfig
 from processing.track.pool import Pool, pooled, sides
@@ -34,7 +35,11 @@ class RegisterConfig:
     """How placements of tosses are made and judged."""
 
     keyframes: int = 10
-    """Views of a toss that take part, spread over directions."""
+    """Least views of a toss that take part, spread over directions; ..."""
+    most_keyframes: int = 20
+    """... of few tosses up to so many, ..."""
+    many: int = 40
+    """... so that there are about so many; of a toss that they leave ambiguous so many alone."""
     worst: float = 0.05
     """A toss whose best placement is contradicted more is left out."""
     good: float = 0.01
@@ -47,6 +52,7 @@ class RegisterConfig:
     contradiction: ContradictionConfig = field(default_factory=ContradictionConfig)
     joint: GraphConfig = field(default_factory=lambda: GraphConfig(loops=10, neighbours=1))
     shape: ShapeConfig = field(default_factory=ShapeConfig)
+    ground: FootingConfig = field(default_factory=FootingConfig)
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,6 +116,12 @@ class _Placing:
             return against.fitted(rivals)
         return against.fitted([*proposed, *against.all_around()])
 
+    def told_apart(self, toss: int, rivals: list[Fit], pool: Pool) -> list[Fit]:
+        """Placements judged again by the many views of another pool."""
+        config = replace(self.config, contradiction=replace(self.config.contradiction, views=self.config.many))
+        against = replace(self, pool=pool, rims=Rims.of(pool.store), config=config).opposed(toss)
+        return rivals if against is None else against.judged(rivals)
+
     def place(self, toss: int, found: list[Fit], most: float) -> bool:
         """Take the best placement, if it is not contradicted by more than `most`."""
         if not found or found[0].cost > most:
@@ -138,17 +150,19 @@ def register_tosses(
         raise BadInput("no toss to register; wanted at least one track")
     if len({t.track.camera for t in tosses}) > 1:
         raise BadInput(f"tracks of several cameras ({sorted({t.track.camera for t in tosses})}); wanted one camera")
-    pool = pooled(tosses, model, config.keyframes, config.shape)
+    views = int(np.clip(config.many // len(tosses), config.keyframes, config.most_keyframes))
+    pool = pooled(tosses, model, [views] * len(tosses), config.shape, config.ground)
     root, count = (0, len(tosses)) if model is None else (len(tosses), len(tosses) + 1)
     fit = np.zeros(count) if together else np.where(np.arange(count) == root, 0.0, np.nan)
     placing = _Placing(pool, Rims.of(pool.store), matcher, config, np.tile(np.eye(4), (count, 1, 1)), fit)
-    gap = (
-        np.full(count, np.inf) if together else _placed(placing, [t for t in range(len(tosses)) if t != root], progress)
-    )
+    gap = np.full(count, np.inf)
+    if not together:
+        others = [t for t in range(len(tosses)) if t != root]
+        gap = _placed(placing, others, lambda t: _many_views(tosses, model, t, config), progress)
     fixed = pool.toss == root
     if model is None:
         fixed[1:] = False
-    poses = _refined(pool, np.isfinite(fit), placing.first_from_own, fixed, _tied(tosses, pool), config)
+    poses = _refined(pool, placing.rims, np.isfinite(fit), placing.first_from_own, fixed, _tied(tosses, pool), config)
     fit, gap, first_from_own = fit[: len(tosses)], gap[: len(tosses)], placing.first_from_own[: len(tosses)]
     tracks = [_moved_track(toss, pool, t, poses, bool(np.isfinite(fit[t]))) for t, toss in enumerate(tosses)]
     joined = np.isfinite(fit)
@@ -156,9 +170,19 @@ def register_tosses(
     return Registered(tuple(tracks), tuple(map(bool, joined)), fit, first_from_own, gap, tuple(map(bool, unsure)))
 
 
-def _placed(placing: _Placing, tosses: list[int], progress: Progress) -> Float[Array, " t"]:
+def _many_views(tosses: Sequence[TossTrack], model: ObjectShape | None, toss: int, config: RegisterConfig) -> Pool:
+    """Many views of one toss, and together as many of the others."""
+    of_others = max(config.keyframes, config.many // max(len(tosses) - 1, 1))
+    counts = [config.many if t == toss else of_others for t in range(len(tosses))]
+    return pooled(tosses, model, counts, config.shape, config.ground)
+
+
+def _placed(
+    placing: _Placing, tosses: list[int], many: Callable[[int], Pool], progress: Progress
+) -> Float[Array, " t"]:
     """Places tosses one by one: those first that leave no doubt, because others may then be told apart by what these
-    show. Returns how much more the best different placement of each is contradicted."""
+    show. A toss that stays ambiguous is judged by `many` views. Returns how much more the best different placement of
+    each is contradicted."""
     config, waiting, found = placing.config, list(tosses), dict[int, list[Fit]]()
     for most, least_gap in ((0.5 * config.worst, config.ambiguous), (0.5 * config.worst, 0.0), (config.worst, 0.0)):
         for t in list(waiting):
@@ -174,6 +198,8 @@ def _placed(placing: _Placing, tosses: list[int], progress: Progress) -> Float[A
             gap[t] = _gap(found[t])
             continue
         again = against.fitted(rivals)  # now against all the others
+        if _gap(again) < config.ambiguous:
+            again = placing.told_apart(t, again, many(t))
         placing.place(t, again, np.inf)
         gap[t] = _gap(again)
     return gap
@@ -195,7 +221,7 @@ def _gap(found: list[Fit]) -> float:
 
 
 def _refined(
-    pool: Pool, joined: Bool[Array, " t"], first_from_own: Float[Array, "t 4 4"], fixed: Bool[Array, " n"],
+    pool: Pool, rims: Rims, joined: Bool[Array, " t"], first_from_own: Float[Array, "t 4 4"], fixed: Bool[Array, " n"],
     tied: Int[Array, " n"], config: RegisterConfig,
 ) -> Float[Array, "n 4 4"]:  # fmt: skip
     """All keyframes of all joined tosses at once (the first toss's first one is fixed, or a learned shape's views);
@@ -206,7 +232,11 @@ def _refined(
     # keyframes are far apart in time: the pull towards free flight says nothing between them
     motion = Motion(pool.frame.astype(np.float64), np.arange(len(poses)), np.zeros(3), pool.center_m, none)
     graph = replace(config.joint, spread_in_time=1)
-    return refine(pool.store, poses, use, fixed, motion, graph, tied=tied).poses
+    beside = (
+        replace(pool.footing, views=np.flatnonzero(use)),
+        Contradictions.of(pool, rims, use, config.contradiction),
+    )
+    return refine(pool.store, poses, use, fixed, motion, graph, tied=tied, beside=beside).poses
 
 
 def _moved_track(

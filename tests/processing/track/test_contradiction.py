@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy import ndarray as Array
 
-from processing.track.contradiction import ContradictionConfig, Opposed, Rims
+from processing.track import kernels as k
+from processing.track.contradiction import ContradictionConfig, Contradictions, Opposed, Rims
 from processing.track.contradiction import _against as against
+from processing.track.footing import Footing, FootingConfig
 from processing.track.keyframes import view_directions
 from processing.track.known_shape import ShapeConfig, shape_views
 from processing.track.optics import Optics
@@ -57,7 +61,9 @@ def opposed(shape: ObjectShape, apart: bool) -> Opposed:
     toss = np.repeat([0, 1], [len(h) for h in halves])
     poses = drawn.poses[chosen]
     poses[toss == 1] = poses[toss == 1] @ FIRST_FROM_OWN
-    pool = Pool(store, poses, toss, np.arange(len(chosen)), np.zeros(3))
+    nowhere = np.full(len(chosen), -1), np.full((len(chosen), 4), np.nan)
+    ground = Footing(store, np.arange(len(chosen)), *nowhere, FootingConfig())
+    pool = Pool(store, poses, toss, np.arange(len(chosen)), np.zeros(3), ground)
     both = sides(pool, 1, np.array([0]), np.tile(np.eye(4), (2, 1, 1)))
     return Opposed.of(both, Rims.of(store), CONFIG)
 
@@ -148,3 +154,47 @@ def test_of_placements_that_say_the_same_the_better_is_kept() -> None:
     far[:3, :3] = rotation_exp(np.array([0.0, 0.0, 1.0]))
     kept = distinct([Fit(np.eye(4), 0.02), Fit(near, 0.01), Fit(far, 0.03), Fit(far, np.inf)])
     assert [f.cost for f in kept] == [0.01, 0.03]
+
+
+def test_two_tosses_that_show_opposite_sides_are_tied_by_the_table() -> None:
+    """One toss stands on a side that the other sees; without the table the placement tilts."""
+    both = opposed(prism(SLENDER, 0.166, None), apart=True)
+    pool = both.both.pool
+    off_place = FIRST_FROM_OWN.copy()
+    off_place[:3, :3] = rotation_exp(np.array([0.03, -0.02, 0.03])) @ off_place[:3, :3]
+    alone = both.aligned(off_place, both.config.fine)
+    middle_y = float(np.mean([c[1] for c in SLENDER]))
+    theirs = int(both.both.theirs[0])
+    pose = pool.poses[theirs]
+    up = pose[:3, :3] @ [0.0, 1.0, 0.0]  # the prism stands on its side y = 0
+    pool.footing.stand[theirs] = 0
+    pool.footing.planes[theirs] = [*up, middle_y - up @ pose[:3, 3]]
+    tied = both.aligned(off_place, both.config.fine, grounded=True)
+
+    def tilt_deg(found: Array) -> float:
+        normal = found[:3, :3] @ FIRST_FROM_OWN[:3, :3].T @ [0.0, 1.0, 0.0]
+        return float(np.degrees(np.arccos(np.clip(normal[1], -1, 1))))
+
+    assert tilt_deg(tied) < 0.15
+    assert tilt_deg(tied) < tilt_deg(alone)
+
+
+def test_contradictions_pull_a_toss_back_among_all_poses() -> None:
+    both = opposed(prism(SLENDER, 0.166, None), apart=True)
+    pool = both.both.pool
+    poses = pool.poses.copy()
+    mine = pool.toss == 1
+    aside = np.eye(4)
+    aside[:3, 3] = [0.006, 0.0, -0.004]
+    poses[mine] = pool.poses[mine] @ np.linalg.inv(FIRST_FROM_OWN) @ aside
+    config = replace(CONFIG, joint_share=1.0)
+    terms = Contradictions.of(pool, Rims.of(pool.store), np.ones(len(poses), dtype=bool), config)
+    place = np.where(mine, 0, -1)
+    for _ in range(15):
+        H, g = np.zeros((1, 1, 6, 6)), np.zeros((1, 6))
+        terms.add(H, g, poses, place)
+        twist = -np.linalg.solve(H[0, 0], g[0])
+        poses[mine] = poses[mine] @ k.inverse(k.exponential(twist))
+    left = np.linalg.inv(FIRST_FROM_OWN @ np.linalg.inv(pool.poses[mine][0]) @ poses[mine][0])
+    assert np.linalg.norm(left[:3, 3]) < 0.002
+    assert np.degrees(np.arccos((np.trace(left[:3, :3]) - 1) / 2)) < 1.5

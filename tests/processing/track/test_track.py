@@ -16,8 +16,9 @@ from processing.track import kernels as k
 from processing.track import story
 from processing.track.features import rigid_fit
 from processing.track.flags import camera_covariance
-from processing.track.graph import GraphConfig, Motion, _add_motion, flight_center, refine
+from processing.track.graph import GraphConfig, Motion, _add_motion, refine
 from processing.track.keyframes import KeyframeConfig, references
+from processing.track.middle import flight_center
 from processing.track.motion import MotionConfig, all_turns, change_cost, moved, steady_spin, turn_between
 from processing.track.multi_hypothesis import read_toss_track, write_toss_track
 from processing.track.optics import Optics
