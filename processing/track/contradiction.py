@@ -39,7 +39,7 @@ class ContradictionConfig:
     """The scales at which a placement is judged: so much is a clear contradiction by a third."""
     rim_share: float = 0.25
     """What a contradicted point of the rim counts, against one of the surface."""
-    joint_share: float = 0.05
+    joint_share: float = 0.02
     """What contradictions count in a refinement of all poses, against pairs that see the same side, which err less."""
     turns: int = 216
     """Turns tried all around ..."""

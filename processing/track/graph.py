@@ -57,8 +57,8 @@ class GraphConfig:
     still_rad: float = 0.003
     still_m: float = 0.0002
     """What a body that stands still may move between frames (standard deviation)."""
-    carried_rad: float = 0.001
-    carried_m: float = 0.0004
+    carried_rad: float = 0.0003
+    carried_m: float = 0.00012
     """Standard deviation of what a held body moves in the hand from frame to frame (slipping is an outlier) ..."""
     held_rad: float = 0.08
     held_m: float = 0.015
