@@ -125,7 +125,8 @@ def footing(store: ViewStore, poses: Float[Array, "n 4 4"], views: Int[Array, " 
 
 
 def _still_runs(poses: Float[Array, "n 4 4"], views: list[int], config: FootingConfig) -> list[list[int]]:
-    """Views in a row, each as near to the first as a body that does not move."""
+    """Views in a row, each as near to the first as a body that does not move: told by the poses of a finished track,
+    because the masks of a body at rest flicker more than `ViewStore.stands_still` allows."""
     runs: list[list[int]] = [[]]
     for i in views:
         if runs[-1] and not _same_place(poses[runs[-1][0]], poses[i], config):

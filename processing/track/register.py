@@ -87,13 +87,17 @@ class _Placing:
     known: dict[tuple[int, ...], list[Fit]] = field(default_factory=dict)
     """What was found of a toss (first number) against others."""
 
-    def opposed(self, toss: int) -> Opposed | None:
-        """A toss against all others that are placed; None where either has no view."""
+    def opposed(self, toss: int, many: Pool | None = None) -> Opposed | None:
+        """A toss against all others that are placed, by all views of another pool where one is given; None where
+        either has no view."""
         joined = np.flatnonzero(np.isfinite(self.fit) & (np.arange(len(self.fit)) != toss))
-        both = sides(self.pool, toss, joined, self.first_from_own)
+        pool, rims, config = self.pool, self.rims, self.config.contradiction
+        if many is not None:
+            pool, rims, config = many, Rims.of(many.store), replace(config, views=self.config.many)
+        both = sides(pool, toss, joined, self.first_from_own)
         if len(both.mine) == 0 or len(both.theirs) == 0:
             return None
-        return Opposed.of(both, self.rims, self.config.contradiction)
+        return Opposed.of(both, rims, config)
 
     def found(self, toss: int) -> list[Fit]:
         """Different placements of a toss, the least contradicted first."""
@@ -115,12 +119,6 @@ class _Placing:
                 return [Fit(rivals[0].first_from_own, against.cost(rivals[0].first_from_own))]
             return against.fitted(rivals)
         return against.fitted([*proposed, *against.all_around()])
-
-    def told_apart(self, toss: int, rivals: list[Fit], pool: Pool) -> list[Fit]:
-        """Placements judged again by the many views of another pool."""
-        config = replace(self.config, contradiction=replace(self.config.contradiction, views=self.config.many))
-        against = replace(self, pool=pool, rims=Rims.of(pool.store), config=config).opposed(toss)
-        return rivals if against is None else against.judged(rivals)
 
     def place(self, toss: int, found: list[Fit], most: float) -> bool:
         """Take the best placement, if it is not contradicted by more than `most`."""
@@ -198,8 +196,9 @@ def _placed(
             gap[t] = _gap(found[t])
             continue
         again = against.fitted(rivals)  # now against all the others
-        if _gap(again) < config.ambiguous:
-            again = placing.told_apart(t, again, many(t))
+        closer = placing.opposed(t, many(t)) if _gap(again) < config.ambiguous else None
+        if closer is not None:
+            again = closer.judged(again)
         placing.place(t, again, np.inf)
         gap[t] = _gap(again)
     return gap

@@ -12,15 +12,17 @@ from numpy import ndarray as Array
 from processing.track import kernels as k
 from processing.track.contradiction import ContradictionConfig, Contradictions, Opposed, Rims
 from processing.track.contradiction import _against as against
+from processing.track.features import Sift
 from processing.track.footing import Footing, FootingConfig
 from processing.track.keyframes import view_directions
 from processing.track.known_shape import ShapeConfig, shape_views
 from processing.track.optics import Optics
 from processing.track.pool import Pool, far_apart, sides
 from processing.track.propose import Fit, distinct
-from processing.track.register import RegisterConfig
+from processing.track.register import RegisterConfig, _placed, _Placing
 from processing.track.views import ViewConfig, ViewStore
 from recordings.geometry import CameraModel, rotation_exp
+from recordings.progress import Silent
 from recordings.tracks import ObjectShape
 
 CAMERA = CameraModel("d455", 640, 480, np.array([[386.0, 0, 320], [0, 386, 240], [0, 0, 1]]))
@@ -198,3 +200,22 @@ def test_contradictions_pull_a_toss_back_among_all_poses() -> None:
     left = np.linalg.inv(FIRST_FROM_OWN @ np.linalg.inv(pool.poses[mine][0]) @ poses[mine][0])
     assert np.linalg.norm(left[:3, 3]) < 0.002
     assert np.degrees(np.arccos((np.trace(left[:3, :3]) - 1) / 2)) < 1.5
+
+
+@pytest.mark.parametrize(("corners", "asked"), [(REGULAR, True), (SLENDER, False)], ids=["twins", "one way"])
+def test_many_views_are_asked_only_where_few_leave_a_toss_ambiguous(
+    corners: Sequence[tuple[float, float]], asked: bool
+) -> None:
+    both = opposed(prism(corners, 0.166, None), apart=True)
+    pool, where = both.both.pool, np.tile(np.eye(4), (2, 1, 1))
+    placing = _Placing(pool, both.rims, Sift(), RegisterConfig(contradiction=CONFIG), where, np.array([0.0, np.nan]))
+    asks: list[int] = []
+
+    def many(toss: int) -> Pool:
+        asks.append(toss)
+        return pool
+
+    gap = _placed(placing, [1], many, Silent())
+    assert asks == ([1] if asked else [])
+    assert (gap[1] < AMBIGUOUS) == asked
+    assert np.isfinite(placing.fit[1])
