@@ -22,6 +22,7 @@ $(STAMP): pyproject.toml constraints.txt
 demo: $(STAMP)
 	$(BIN)/toss-session info $(SAMPLE)
 	$(BIN)/toss-process $(SAMPLE) --out $(OUT)/results
+	rm -f $(OUT)/result.rrd $(OUT)/result.png  # toss-view overwrites nothing; these are this target's own
 	$(BIN)/toss-view $(OUT)/results --save $(OUT)/result.rrd
 	$(BIN)/toss-view $(OUT)/results --screenshot $(OUT)/result.png
 	@echo "look at $(OUT)/result.png and $(OUT)/results/report.html, open $(OUT)/result.rrd: $(BIN)/toss-view $(OUT)/results"
