@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 import time
 from collections.abc import Sequence
@@ -140,10 +139,11 @@ def _layout(path: Path) -> tuple[dict[int, float], dict[int, Any]]:
     """Sizes and tagged_from_tag by id."""
     import numpy as np
 
+    from recordings.documents import read_json
     from recordings.geometry import Transform
 
     try:
-        tags = json.loads(path.read_text())["tags"]
+        tags = read_json(path)["tags"]
         poses = {int(t["id"]): np.array(t.get("T_tagged_tag", t.get("T_object_tag")), dtype=np.float64) for t in tags}
         layout = {i: Transform.from_matrix("tagged", f"tag_{i}", pose).matrix for i, pose in poses.items()}
         sizes = {int(t["id"]): float(t["size_m"]) for t in tags}

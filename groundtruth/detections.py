@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import bz2
-import shutil
 import tempfile
-import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +14,7 @@ from jaxtyping import Float, Int64
 from numpy import ndarray as Array
 
 from recordings.errors import BadInput
+from recordings.limits import copy_unpacked, open_npz
 
 APRILTAG_ARRAY = """
 std_msgs/Header header
@@ -65,7 +64,7 @@ def _slashed(topic: str) -> str:
 
 def _read_npz(path: Path) -> Recording:
     try:
-        with np.load(path, allow_pickle=False) as stored:
+        with open_npz(path) as stored:
             data = {name: stored[name] for name in stored.files}
         topics = [_slashed(str(t)) for t in data["topics"]]
         frames: dict[str, dict[int, tuple[Sighting, ...]]] = {}
@@ -81,7 +80,7 @@ def _read_npz(path: Path) -> Recording:
                 tail = name[len("odom_stamp_ns__") :]
                 odometry["/" + tail.replace("__", "/")] = (data[name], _poses(data[f"odom_xyz_qxyzw__{tail}"]))
         return Recording(frames, odometry)
-    except (KeyError, ValueError, OSError, IndexError, EOFError, zipfile.BadZipFile) as wrong:
+    except (KeyError, ValueError, OSError, IndexError, TypeError) as wrong:
         raise BadInput(f"{path} is not a recording of detections ({type(wrong).__name__}: {wrong})") from wrong
 
 
@@ -98,17 +97,21 @@ def _read_bag(path: Path) -> Recording:
     """Through `rosbags`, with the message definitions that the bag itself carries."""
     from rosbags.highlevel import AnyReader
 
+    from recordings.importers.ros_bounds import BoundedBag1
+
     with tempfile.TemporaryDirectory() as scratch:
         bag = path
         if path.suffix == ".bz2":
             bag = Path(scratch) / "tag_detections.bag"
             try:
                 with bz2.open(path) as packed, open(bag, "wb") as out:
-                    shutil.copyfileobj(packed, out)
-            except (OSError, EOFError) as wrong:
+                    copy_unpacked(packed, out, path.stat().st_size)
+            except (OSError, EOFError, ValueError) as wrong:
                 raise BadInput(f"{path} cannot be unpacked ({wrong})") from wrong
         try:
-            with AnyReader([bag]) as reader:
+            reader = AnyReader([bag])
+            reader.readers = [BoundedBag1(bag)]
+            with reader:
                 return _collect(reader)
         except BadInput:
             raise

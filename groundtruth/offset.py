@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +12,7 @@ from jaxtyping import Float, Int
 from numpy import ndarray as Array
 from scipy.spatial.transform import Rotation
 
+from recordings.documents import read_json
 from recordings.errors import BadInput
 from recordings.geometry import Transform
 
@@ -33,7 +33,7 @@ def tagged_frame(layout: Mapping[int, Float[Array, "4 4"]]) -> Float[Array, "4 4
 def read_object_from_tagged(path: Path) -> Transform:
     """A JSON file with a 4x4 matrix, bare or as `object_from_tagged` (also {"matrix": …})."""
     try:
-        document = json.loads(path.read_text())
+        document = read_json(path)
         stored = document.get("object_from_tagged", document) if isinstance(document, dict) else document
         matrix = stored["matrix"] if isinstance(stored, dict) else stored
         return Transform.from_matrix("object", "tagged", np.array(matrix, dtype=np.float64))

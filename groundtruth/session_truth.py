@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import io
-import json
 import shutil
 import tempfile
 from collections.abc import Mapping, Sequence
@@ -32,8 +31,10 @@ from groundtruth.session_solve import Solved, solve_session
 from groundtruth.toss_truth import TossTruth, TrackedLimits, at_color_frames
 from groundtruth.verdict import Verdict, judge
 from groundtruth.witness import Witness, WitnessConfig, witness
+from recordings.documents import json_object
 from recordings.errors import BadInput
 from recordings.geometry import Transform
+from recordings.mesh_file import load_mesh
 from recordings.progress import Progress, Silent
 from recordings.records import StampedPose
 from recordings.session import Session
@@ -198,11 +199,7 @@ def _in_tagged_frame(solved: Solved, config: TruthConfig) -> Solved:
 
 def fit_mesh(truth: SessionTruth, mesh_path: Path) -> Fit:
     """Where the tags lie on a known shape. Raises BadInput where they fit nowhere."""
-    import trimesh
-
-    mesh = trimesh.load(mesh_path, force="mesh", process=False)
-    if len(mesh.vertices) == 0:
-        raise BadInput(f"{mesh_path} holds no triangles; wanted the object's surface in metres (.obj, .ply or .stl)")
+    mesh = load_mesh(mesh_path)
     fit = object_from_tagged_by_mesh(
         truth.solved.layout, truth.sizes_m, np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
     )
@@ -231,8 +228,8 @@ def write_session_truth(
 def replace_folder(old: Path) -> None:
     """Remove an earlier truth/ of this command; someone else's is left alone. Raises BadInput."""
     source = {}
-    with contextlib.suppress(OSError, ValueError):
-        source = json.loads((old / "truth.json").read_text())
+    with contextlib.suppress(OSError):
+        source = json_object((old / "truth.json").read_bytes())
     if str(source.get("source", "")).startswith("toss-truth"):
         shutil.rmtree(old)
         return
@@ -288,7 +285,7 @@ def _obj_bytes(path: Path) -> bytes:
 
     if path.suffix.lower() == ".obj":
         return path.read_bytes()
-    mesh = trimesh.load(path, force="mesh", process=False)
+    mesh = load_mesh(path)
     return str(trimesh.exchange.obj.export_obj(mesh)).encode()
 
 

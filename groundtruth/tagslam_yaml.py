@@ -13,12 +13,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from jaxtyping import Float
 from numpy import ndarray as Array
 
 from recordings.errors import BadInput
 from recordings.geometry import rotation_exp
+from recordings.yaml_file import parse_yaml
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,13 +68,10 @@ def rounded_ns(value: Any) -> int:
 
 def load(path: Path) -> dict[str, Any]:
     try:
-        text = path.read_text()
+        data = path.read_bytes()
     except OSError as refused:
         raise BadInput(f"{path} cannot be read: {refused.strerror}; wanted a TagSLAM configuration folder") from refused
-    try:
-        document = yaml.safe_load(_times_as_text(text))
-    except yaml.YAMLError as wrong:
-        raise BadInput(f"{path} is no readable YAML ({' '.join(str(wrong).split())})") from wrong
+    document = parse_yaml(data, str(path), _times_as_text)
     if not isinstance(document, dict):
         raise BadInput(f"{path}: wanted a mapping at the top, found {type(document).__name__}")
     return document

@@ -28,7 +28,7 @@ from processing.metrics import (
 )
 from processing.phases import PHASES, Phase, frame_phases
 from processing.truth import Truth
-from recordings.errors import BadInput
+from recordings.mesh_file import load_mesh
 from recordings.results import Results, VariantRecord, read_contact
 from recordings.tracks import ObjectShape, ObjectTrack
 
@@ -285,12 +285,4 @@ def _mean(values: list[float]) -> float:
 
 def true_mesh(truth: Truth) -> trimesh.Trimesh | None:
     """The true surface, where the truth has one. Raises BadInput where it cannot be read."""
-    import trimesh
-
-    if truth.mesh_path is None:
-        return None
-    try:
-        mesh = trimesh.load(truth.mesh_path, force="mesh", process=False)
-    except (ValueError, OSError) as wrong:
-        raise BadInput(f"{truth.mesh_path} cannot be read as a mesh ({wrong})") from wrong
-    return mesh
+    return None if truth.mesh_path is None else load_mesh(truth.mesh_path)

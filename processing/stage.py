@@ -19,6 +19,7 @@ from dataclasses import asdict, dataclass, is_dataclass
 from pathlib import Path
 from typing import Any
 
+from recordings.documents import read_json
 from recordings.errors import BadInput, WriteFailed
 
 Counts = Mapping[str, Any]
@@ -117,12 +118,9 @@ def _timed(
 
 
 def _finished(folder: Path, key: str) -> Done | None:
-    try:
-        document = json.loads((folder / "stage.json").read_text())
-    except FileNotFoundError:
+    if not (folder / "stage.json").exists():
         return None
-    except (json.JSONDecodeError, UnicodeDecodeError) as wrong:
-        raise BadInput(f"{folder}/stage.json is damaged ({wrong}); remove that folder and run again") from wrong
+    document = read_json(folder / "stage.json", "; remove that folder and run again")
     if document.get("key") != key:
         raise BadInput(f"{folder} belongs to another key ({document.get('key')}); remove that folder and run again")
     return Done(folder, key, document.get("counts", {}), reused=True)

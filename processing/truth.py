@@ -6,7 +6,6 @@ folder of the folder layout (toss_XX/poses_camera_object.npz, mesh.obj). Nothing
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,8 +15,10 @@ from jaxtyping import Float, Int64
 from numpy import ndarray as Array
 
 from processing.start_pose import StartPose
+from recordings.documents import json_object
 from recordings.errors import BadInput, DamagedFile
 from recordings.geometry import Transform
+from recordings.limits import open_npz
 from recordings.session import Session, Toss
 from recordings.tracks import ObjectTrack, RigCalibration
 
@@ -111,7 +112,7 @@ def open_truth(given: Path | None, session: Session, calibration: RigCalibration
 def _folder_poses(path: Path, first_frame_ns: int) -> tuple[Int64[Array, " m"], Float[Array, "m 4 4"]]:
     """Poses of the folder layout; its times count from the toss's first colour frame."""
     try:
-        with np.load(path, allow_pickle=False) as stored:
+        with open_npz(path) as stored:
             times_s, poses = stored["t"].reshape(-1), stored["T_camera_object"].reshape(-1, 4, 4)
     except (OSError, KeyError, ValueError) as wrong:
         raise DamagedFile(f"{path} cannot be read as true poses ({wrong})") from wrong
@@ -133,7 +134,6 @@ def _at_frames(
 
 def _read_document(path: Path) -> dict[str, object]:
     try:
-        document = json.loads(path.read_text())
-    except (OSError, json.JSONDecodeError, UnicodeDecodeError):
+        return json_object(path.read_bytes())
+    except OSError:
         return {}
-    return document if isinstance(document, dict) else {}

@@ -6,17 +6,21 @@ Nothing is ever downloaded. A file is read as tensors alone (`weights_only`); ea
 from __future__ import annotations
 
 import hashlib
-import pickle
+import pickletools
+import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any
 
 from recordings.errors import BadInput
+from recordings.limits import MOST_PICKLE_STEPS
 
 if TYPE_CHECKING:
     from torch import Tensor
 
+LEGACY_PICKLES = 5
+"""Before the numbers of a file by torch older than 1.6: magic, protocol, system, tensors, their order."""
 Shapes = Mapping[str, tuple[int, ...]]
 
 
@@ -74,8 +78,9 @@ def read_weights(path: Path, file: WeightFile, inside: str | None = None) -> dic
     import torch
 
     try:
+        _check_container(path)
         stored: Any = torch.load(path, map_location="cpu", weights_only=True)
-    except (pickle.UnpicklingError, RuntimeError, EOFError, OSError, ValueError, KeyError) as wrong:
+    except Exception as wrong:  # torch's unpickler raises whatever a hostile file makes it raise
         reason = str(wrong).strip().splitlines() or [type(wrong).__name__]
         raise BadInput(f"{path} is no readable checkpoint ({reason[0][:120]}); wanted: {file}. Get it again") from wrong
     if isinstance(stored, Mapping) and inside is not None and inside in stored:
@@ -83,6 +88,36 @@ def read_weights(path: Path, file: WeightFile, inside: str | None = None) -> dic
     if not isinstance(stored, Mapping) or not all(isinstance(v, torch.Tensor) for v in stored.values()):
         raise BadInput(f"{path} holds no tensors by layer name; wanted: {file}")
     return {str(k): v for k, v in stored.items()}
+
+
+def _check_container(path: Path) -> None:
+    """As torch.save packs: nothing compressed or over another, pickles of a network's length. Raises ValueError."""
+    with open(path, "rb") as file:
+        if not zipfile.is_zipfile(file):
+            file.seek(0)
+            return _check_pickles(file, LEGACY_PICKLES)
+    with zipfile.ZipFile(path) as archive:
+        entries = archive.infolist()
+        if any(e.compress_type != zipfile.ZIP_STORED for e in entries):
+            raise ValueError("its parts are compressed, which torch.save never does")
+        if sum(e.file_size for e in entries) > path.stat().st_size:
+            raise ValueError("its parts lie over one another")
+        for entry in entries:
+            if entry.filename.endswith(".pkl"):
+                with archive.open(entry) as file:
+                    _check_pickles(file, 1)
+
+
+def _check_pickles(file: IO[bytes], count: int) -> None:
+    """Walk the opcodes, which builds nothing."""
+    steps = 0
+    for _ in range(count):
+        for opcode, argument, _ in pickletools.genops(file):
+            steps += 1
+            if steps > MOST_PICKLE_STEPS:
+                raise ValueError(f"its pickle has more than {MOST_PICKLE_STEPS} steps")
+            if opcode.name == "GLOBAL" and str(argument).split()[0] in ("builtins", "__builtin__", "_codecs"):
+                raise ValueError(f"its pickle asks for {argument}, which tensors do not need")
 
 
 def check_layers(found: Mapping[str, Tensor], wanted: Shapes, path: Path, file: WeightFile) -> None:

@@ -23,6 +23,7 @@ from google.protobuf.message import DecodeError
 from jaxtyping import Float, UInt8
 from numpy import ndarray as Array
 
+from recordings import limits
 from recordings.depth_codec import DEPTH_CODEC
 from recordings.depth_codec import pack_depth as pack_depth
 from recordings.depth_codec import unpack_depth as unpack_depth
@@ -129,13 +130,12 @@ def decode_image(image: EncodedImage) -> UInt8[Array, "h w *c"]:
         if len(image.data) != int(np.prod(shape)):
             raise DamagedFile(f"{name}: {len(image.data)} bytes are not {image.width}x{image.height} {image.encoding}")
         return np.frombuffer(image.data, dtype=np.uint8).reshape(shape)
-    pixels = _imdecode(image.data, cv2.IMREAD_UNCHANGED)
-    if pixels is None or pixels.dtype != np.uint8:
+    found = limits.image_size(image.data)
+    if found is not None and found != (image.width, image.height):
+        raise DamagedFile(f"{name}: {found[0]}x{found[1]} pixels, the calibration says {image.width}x{image.height}")
+    pixels = decode_pixels(image.data, name)
+    if pixels is None or pixels.dtype != np.uint8 or pixels.shape[:2] != (image.height, image.width):
         raise DamagedFile(f"{name}: its {len(image.data)} bytes are no 8-bit {image.encoding} image")
-    if pixels.shape[:2] != (image.height, image.width):
-        raise DamagedFile(
-            f"{name}: {pixels.shape[1]}x{pixels.shape[0]} pixels, the calibration says {image.width}x{image.height}"
-        )
     return cv2.cvtColor(pixels[..., :3], cv2.COLOR_BGR2RGB) if pixels.ndim == 3 else pixels
 
 
@@ -298,17 +298,26 @@ def encode_mask(mask: Array) -> bytes:
 
 def decode_mask(data: bytes, name: str) -> Array:
     """A mask (h w, bool) from PNG: any value above 0 in any channel is inside."""
-    pixels = _imdecode(data, cv2.IMREAD_UNCHANGED)
+    pixels = decode_pixels(data, name)
     if pixels is None:
         raise DamagedFile(f"{name}: no readable PNG")
     return np.asarray(pixels.any(axis=-1) if pixels.ndim == 3 else pixels > 0)
 
 
-def _imdecode(data: bytes, flags: int) -> Array | None:
-    if not data:
+def decode_pixels(data: bytes, name: str) -> Array | None:
+    """A PNG's or JPEG's pixels in OpenCV's order; None where it is neither, or broken.
+
+    Raises DamagedFile when its header declares more pixels than any camera here has: nothing was decoded then.
+    """
+    size = limits.image_size(data)
+    if size is None:
         return None
+    if size[0] * size[1] > limits.MOST_PIXELS:
+        raise DamagedFile(
+            f"{name}: its header declares {size[0]}x{size[1]} pixels; wanted at most {limits.MOST_PIXELS} in all"
+        )
     try:
-        return cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags)
+        return cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:
         return None
 

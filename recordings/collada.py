@@ -12,6 +12,8 @@ from jaxtyping import Float, Int
 from numpy import ndarray as Array
 
 from recordings.errors import BadInput
+from recordings.limits import MOST_VERTICES
+from recordings.xml_file import read_xml
 
 GREY = (0.5, 0.5, 0.5)
 
@@ -27,10 +29,14 @@ class ColoredMesh:
 
 def read_collada(path: Path) -> ColoredMesh:
     """All geometries of the scene, placed by their nodes' matrices. Raises BadInput for what it does not know."""
+    root = read_xml(path, "Collada")
     try:
-        root = ET.parse(path).getroot()
-    except (OSError, ET.ParseError) as wrong:
-        raise BadInput(f"{path}: cannot be read as Collada ({wrong})") from wrong
+        return _mesh(root, path)
+    except (LookupError, ValueError, RuntimeError) as wrong:
+        raise BadInput(f"{path}: cannot be read as Collada ({type(wrong).__name__}: {wrong})") from wrong
+
+
+def _mesh(root: ET.Element, path: Path) -> ColoredMesh:
     for element in root.iter():
         element.tag = element.tag.rpartition("}")[2]
     up = root.findtext("asset/up_axis", "Y_UP")
@@ -50,17 +56,21 @@ def read_collada(path: Path) -> ColoredMesh:
 
 
 def _placed_parts(root: ET.Element, path: Path) -> Iterator[tuple[Array, Array, Array]]:
-    geometries = {g.attrib["id"]: g for g in root.iter("geometry")}
+    geometries = {g.attrib["id"]: list(_groups(g, path)) for g in root.iter("geometry")}
+    color = _colors(root)
+    count = 0
     for node in root.iter("node"):
         text = node.findtext("matrix")
         matrix = np.array([float(v) for v in text.split()]).reshape(4, 4) if text else np.eye(4)
         for instance in node.findall("instance_geometry"):
-            geometry = geometries[instance.attrib["url"].lstrip("#")]
             colors = {
-                bound.attrib["symbol"]: _color(root, bound.attrib["target"].lstrip("#"))
+                bound.attrib["symbol"]: color.get(bound.attrib["target"].lstrip("#"), GREY)
                 for bound in instance.iter("instance_material")
             }
-            for vertices, faces, symbol in _groups(geometry, path):
+            for vertices, faces, symbol in geometries[instance.attrib["url"].lstrip("#")]:
+                count += len(vertices) + len(faces)
+                if count > MOST_VERTICES:
+                    raise BadInput(f"{path}: more than {MOST_VERTICES} vertices and faces, its instances written out")
                 placed = vertices @ matrix[:3, :3].T + matrix[:3, 3]
                 yield placed, faces, np.array(colors.get(symbol, GREY))
 
@@ -83,16 +93,18 @@ def _groups(geometry: ET.Element, path: Path) -> Iterator[tuple[Array, Array, st
             raise BadInput(f"{path}: has polygons; wanted triangles only")
         array = sources[positions[vertex.attrib["source"].lstrip("#")]].findtext("float_array") or ""
         points = np.array([float(v) for v in array.split()]).reshape(-1, 3)
+        if len(corners) and not 0 <= corners.min() <= corners.max() < len(points):
+            raise BadInput(f"{path}: a triangle names a vertex that is not there")
         yield points, corners.reshape(-1, 3), group.attrib.get("material", "")
 
 
-def _color(root: ET.Element, material: str) -> tuple[float, ...]:
-    """Diffuse colour of a material; grey where the file says none."""
-    effects = {e.attrib["id"]: e for e in root.iter("effect")}
+def _colors(root: ET.Element) -> dict[str, tuple[float, ...]]:
+    """Diffuse colours by material, where the file says one."""
+    effects = {e.attrib["id"]: e.findtext(".//diffuse/color") for e in root.iter("effect")}
+    found = {}
     for one in root.iter("material"):
         instance = one.find("instance_effect")
-        if one.attrib["id"] == material and instance is not None:
-            text = effects[instance.attrib["url"].lstrip("#")].findtext(".//diffuse/color")
-            if text:
-                return tuple(float(v) for v in text.split()[:3])
-    return GREY
+        text = None if instance is None else effects[instance.attrib["url"].lstrip("#")]
+        if text:
+            found[one.attrib["id"]] = tuple(float(v) for v in text.split()[:3])
+    return found

@@ -19,13 +19,13 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 from numpy import ndarray as Array
 
 from recordings.errors import BadInput, DamagedFile
+from recordings.limits import open_npz
 from recordings.results import Results, VariantRecord, read_shape, read_track
 from recordings.tracks import ObjectShape, ObjectTrack
 
@@ -240,7 +240,7 @@ class _Reader:
         if path not in self._arrays:
             self._arrays[path] = {}
             if path.exists():
-                with _damage(path), np.load(path, allow_pickle=False) as stored:
+                with _damage(path), open_npz(path) as stored:
                     self._arrays[path] = {name: stored[name] for name in stored.files}
         return self._arrays[path]
 
@@ -259,5 +259,5 @@ def _damage(path: Path) -> Iterator[None]:
     """Turns what a broken file raises into DamagedFile."""
     try:
         yield
-    except (OSError, ValueError, KeyError, IndexError, EOFError, BadZipFile) as wrong:
+    except (OSError, ValueError, KeyError, IndexError) as wrong:
         raise DamagedFile(f"{path} cannot be read ({wrong}); remove its folder and run toss-process again") from wrong

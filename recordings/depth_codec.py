@@ -11,9 +11,9 @@ from jaxtyping import UInt16
 from numpy import ndarray as Array
 
 from recordings.errors import DamagedFile
+from recordings.limits import MOST_PIXELS
 
 DEPTH_CODEC = "delta-planes-zstd"
-MOST_BYTES = 1 << 28
 # Of zstd's settings only the compressor's; any decoder reads the frames. Short matches cost more than they save in the
 # noise of the low bytes, and a table of 2^13 entries stays in the first-level cache.
 _SETTINGS = zstandard.ZstdCompressionParameters(
@@ -58,7 +58,7 @@ def unpack_depth(data: bytes, height: int, width: int) -> UInt16[Array, "h w"]:
     """The inverse of pack_depth. Raises DamagedFile when the bytes do not hold height x width values."""
     size = 2 * height * width
     try:
-        if not 0 < size <= MOST_BYTES or zstandard.frame_content_size(data) != size:
+        if not 0 < size <= 2 * MOST_PIXELS or zstandard.frame_content_size(data) != size:
             raise ValueError(f"they do not hold {width}x{height} values")
         planes = np.frombuffer(_tools.decompressor.decompress(data), dtype=np.uint8).reshape(2, height, width)
     except (zstandard.ZstdError, ValueError, MemoryError) as wrong:

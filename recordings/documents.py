@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from recordings.errors import BadInput, DamagedFile
+from recordings.limits import DEEPEST, MOST_DOCUMENT_BYTES
 
 FORMAT_VERSION = 1
 
@@ -20,8 +21,8 @@ def as_dict(value: object) -> dict[str, Any]:
 def json_object(text: str | bytes) -> dict[str, Any]:
     """A text that should be a JSON object; an empty one where it is not."""
     try:
-        return as_dict(json.loads(text))
-    except (ValueError, RecursionError):
+        return as_dict(parse_json(text, ""))
+    except DamagedFile:
         return {}
 
 
@@ -44,11 +45,45 @@ def parse_document(data: bytes, name: str) -> Mapping[str, Any]:
 
 
 def parse_json(data: bytes | str, name: str) -> Any:
-    """Raises DamagedFile."""
+    """A JSON text, of a size and depth that documents have. Raises DamagedFile."""
+    if len(data) > MOST_DOCUMENT_BYTES:
+        raise DamagedFile(f"{name} is a JSON document of {len(data)} bytes; wanted at most {MOST_DOCUMENT_BYTES}")
+    too_deep = f"{name} is no readable JSON: it is nested deeper than {DEEPEST} levels"
     try:
-        return json.loads(data)
-    except (ValueError, RecursionError) as wrong:
+        value = json.loads(data)
+    except RecursionError as wrong:
+        raise DamagedFile(too_deep) from wrong
+    except ValueError as wrong:
         raise DamagedFile(f"{name} is no readable JSON ({wrong})") from wrong
+    if not _within_depth(value):
+        raise DamagedFile(too_deep)
+    return value
+
+
+def read_json(path: Path, next_step: str = "") -> Any:
+    """A JSON file. Raises BadInput where it cannot be opened, DamagedFile where it is none; `next_step` ends both."""
+    try:
+        data = path.read_bytes()
+    except OSError as refused:
+        raise BadInput(f"{path} cannot be read ({refused.strerror}){next_step}") from refused
+    try:
+        return parse_json(data, str(path))
+    except DamagedFile as wrong:
+        raise DamagedFile(f"{wrong}{next_step}") from wrong
+
+
+def _within_depth(value: Any) -> bool:
+    level = [value] if isinstance(value, dict | list) else []
+    for _ in range(DEEPEST):
+        level = [
+            inner
+            for outer in level
+            for inner in (outer.values() if isinstance(outer, dict) else outer)
+            if isinstance(inner, dict | list)
+        ]
+        if not level:
+            return True
+    return False
 
 
 def mapping(value: Any, name: str) -> Mapping[str, Any]:

@@ -18,9 +18,7 @@ from functools import cached_property, partial
 from pathlib import Path
 from typing import TypeVar
 
-import lz4.frame
 import numpy as np
-import zstandard
 from jaxtyping import Int64
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
@@ -29,11 +27,11 @@ from mcap.stream_reader import StreamReader
 from mcap.summary import Summary
 from numpy import ndarray as Array
 
+from recordings import limits
 from recordings.errors import BadInput, DamagedFile
 from recordings.mcap_writer import LATEST_NS, MAGIC
 
 CACHED_CHUNKS = 4
-MAX_CHUNK_BYTES = 1 << 30
 _MESSAGE_HEAD = struct.Struct("<BQHIQQ")
 _CHUNK_HEAD = struct.Struct("<BQQQQI")
 _INDEX_HEAD = struct.Struct("<BQHI")
@@ -152,12 +150,15 @@ class McapFile:
     def attachments(self) -> list[str]:
         return [a.name for a in self.summary.attachment_indexes]
 
+    @cached_property
+    def _attachment_places(self) -> dict[str, int]:
+        return {a.name: a.offset for a in self.summary.attachment_indexes}
+
     def attachment(self, name: str) -> bytes | None:
         """The last attachment of that name; None if there is none."""
-        places = [a.offset for a in self.summary.attachment_indexes if a.name == name]
-        if not places:
+        if name not in self._attachment_places:
             return None
-        record = self._guard(lambda: self._record(places[-1], Attachment), f"attachment {name}")
+        record = self._guard(lambda: self._record(self._attachment_places[name], Attachment), f"attachment {name}")
         return bytes(record.data)
 
     def _check_ends(self) -> None:
@@ -209,6 +210,9 @@ class McapFile:
         if crc and zlib.crc32(footer[:25], zlib.crc32(block)) != crc:
             raise ValueError("the summary's CRC differs")
         summary = _parse_summary(block + footer + MAGIC)
+        limits.Budget(self.size).take(sum(c.uncompressed_size for c in summary.chunk_indexes if c.compression))
+        if sum(c.message_index_length for c in summary.chunk_indexes) > self.size:
+            raise ValueError("its message indexes are longer than the file")
         for channel in summary.channels.values():
             if channel.schema_id and channel.schema_id not in summary.schemas:
                 raise ValueError(f"topic {channel.topic} names a schema that is not there")
@@ -218,12 +222,16 @@ class McapFile:
         """Of every topic, with one read per chunk."""
         topics = {number: topic for topic, numbers in self._ids.items() for number in numbers}
         tables: dict[str, list[Array]] = {}
+        rows = 0
         for number, chunk in enumerate(self.summary.chunk_indexes):
             start = chunk.chunk_start_offset + chunk.chunk_length
             block = self._exactly(start, chunk.message_index_length)
             for channel, place in chunk.message_index_offsets.items():
                 if channel in topics:
                     table = _message_index(block, place - start, chunk.uncompressed_size)
+                    rows += len(table)
+                    if rows > self.size // 16:  # an entry has 16 bytes: some are named more than once
+                        raise ValueError(f"more messages than {self.size} bytes can index")
                     numbered = np.empty((len(table), 3), dtype=np.int64)
                     numbered[:, 0], numbered[:, 1], numbered[:, 2] = table[:, 0], number, table[:, 1]
                     tables.setdefault(topics[channel], []).append(numbered)
@@ -264,9 +272,9 @@ class McapFile:
         chunk, place = self._chunk_place(number)
         whole = self._exactly(chunk.chunk_start_offset, place - chunk.chunk_start_offset + chunk.compressed_size)
         opcode, _, _, _, size, crc = _CHUNK_HEAD.unpack_from(whole)
-        if opcode != Opcode.CHUNK or size != chunk.uncompressed_size or size > MAX_CHUNK_BYTES:
+        if opcode != Opcode.CHUNK or size != chunk.uncompressed_size:
             raise ValueError("the chunk's head and its index disagree")
-        data = decompress(chunk.compression, memoryview(whole)[place - chunk.chunk_start_offset :], size)
+        data = limits.unpack(chunk.compression, memoryview(whole)[place - chunk.chunk_start_offset :], size)
         if crc and zlib.crc32(data) != crc:
             raise ValueError("the chunk's CRC differs")
         return data
@@ -345,25 +353,3 @@ def _parse_summary(block: bytes) -> Summary:
     if summary.statistics is None:
         raise ValueError("no statistics")
     return summary
-
-
-def decompress(compression: str, data: bytes | memoryview, size: int) -> bytes | memoryview:
-    """The raw bytes of a chunk. Raises ValueError when they are not `size` bytes or the compression is unknown."""
-    if size > MAX_CHUNK_BYTES:
-        raise ValueError(f"a chunk of {size} bytes")
-    try:
-        if compression == "":
-            raw: bytes | memoryview = data
-        elif compression == "zstd":
-            if zstandard.frame_content_size(data) not in (-1, size):
-                raise ValueError("the chunk's head and its content disagree in size")
-            raw = zstandard.ZstdDecompressor().decompress(data, max_output_size=size)
-        elif compression == "lz4":
-            raw = lz4.frame.decompress(data)
-        else:
-            raise ValueError(f"chunk compression '{compression}' is not known; wanted none, lz4 or zstd")
-    except (zstandard.ZstdError, RuntimeError) as wrong:
-        raise ValueError(f"{compression} data cannot be decompressed: {wrong}") from wrong
-    if len(raw) != size:
-        raise ValueError(f"a chunk gave {len(raw)} bytes, its head says {size}")
-    return raw

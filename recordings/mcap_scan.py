@@ -20,7 +20,8 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, McapRecord, Metadata, Schema
 
 from recordings.errors import BadInput
-from recordings.mcap_file import MAX_CHUNK_BYTES, RAISED, decompress
+from recordings.limits import MOST_CHUNK_BYTES, SEARCHED_TIMES, Budget, unpack
+from recordings.mcap_file import RAISED
 
 HEAD = struct.Struct("<BQ")
 MESSAGE = struct.Struct("<HIQQ")
@@ -39,10 +40,14 @@ R = TypeVar("R", bound=McapRecord)
 
 
 class Bytes:
-    """A file opened for reading at any place. Raises BadInput when it cannot be opened."""
+    """A file opened for reading at any place. Raises BadInput when it cannot be opened.
+
+    `searched` counts the bytes that were read to find records again.
+    """
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        self.searched = 0
         try:
             self._file = open(path, "rb", buffering=0)  # noqa: SIM115
             self.size = os.fstat(self._file.fileno()).st_size
@@ -128,8 +133,8 @@ def parse_attachment(record: Record) -> Attachment:
     return attachment
 
 
-def parse_chunk(record: Record) -> Chunk:
-    """Raises ValueError when the chunk cannot be decompressed or differs from its CRC."""
+def parse_chunk(record: Record, budget: Budget) -> Chunk:
+    """Raises ValueError when the chunk cannot be decompressed, differs from its CRC or is too much for the file."""
     body = record.body
     try:
         first_ns, last_ns, size, crc = _CHUNK.unpack_from(body, 0)
@@ -141,13 +146,15 @@ def parse_chunk(record: Record) -> Chunk:
         raise ValueError(f"a chunk with a malformed head ({wrong})") from wrong
     if data_at + data_length != len(body):
         raise ValueError(f"a chunk of {len(body)} bytes whose head says {data_at + data_length}")
-    raw = bytes(decompress(name, body[data_at:], size))
+    if name:
+        budget.take(size)
+    raw = bytes(unpack(name, body[data_at:], size))
     if crc and zlib.crc32(raw) != crc:
         raise ValueError("a chunk that differs from its CRC")
     return Chunk(first_ns, last_ns, crc, name, data_length, raw)
 
 
-def chunk_records(raw: bytes) -> Iterator[tuple[int, int, bytes]]:
+def chunk_records(raw: bytes, budget: Budget) -> Iterator[tuple[int, int, bytes]]:
     """(opcode, offset, body) of the records inside a chunk. Raises ValueError when they do not fill it exactly."""
     at = 0
     while at < len(raw):
@@ -157,6 +164,7 @@ def chunk_records(raw: bytes) -> Iterator[tuple[int, int, bytes]]:
         end = at + HEAD.size + length
         if end > len(raw) or (opcode == Opcode.MESSAGE and length < MESSAGE.size):
             raise ValueError("a chunk whose records do not fit into it")
+        budget.record()
         yield opcode, at, raw[at + HEAD.size : end]
         at = end
 
@@ -165,7 +173,8 @@ def find_again(file: Bytes, offset: int, *, loose_messages: bool = False) -> int
     """The offset of the next record that proves itself, at or behind `offset`; the file's size where there is none.
 
     Chunks and attachments prove themselves by lengths that add up, schemas, channels and metadata by being rebuilt
-    byte for byte. `loose_messages`: also messages outside of chunks, by the record that follows.
+    byte for byte. `loose_messages`: also messages outside of chunks, by the record that follows. The search ends where
+    too many bytes were read for what proved to be no record.
     """
     wanted = [*_ANCHORS, Opcode.MESSAGE] if loose_messages else list(_ANCHORS)
     while offset + HEAD.size <= file.size:
@@ -173,7 +182,11 @@ def find_again(file: Bytes, offset: int, *, loose_messages: bool = False) -> int
         block = np.frombuffer(data, dtype=np.uint8)
         for start in np.flatnonzero(np.isin(block[: min(_BLOCK, len(block) - 8)], wanted)).tolist():
             length = HEAD.unpack_from(data, start)[1]
-            if 0 < length <= file.size - offset - start - HEAD.size and _proves_itself(file, offset + start):
+            if not 0 < length <= file.size - offset - start - HEAD.size:
+                continue
+            if file.searched > SEARCHED_TIMES * max(file.size, _BLOCK):
+                return file.size
+            if _proves_itself(file, offset + start):
                 return int(offset + start)
         offset += _BLOCK
     return file.size
@@ -181,6 +194,7 @@ def find_again(file: Bytes, offset: int, *, loose_messages: bool = False) -> int
 
 def _proves_itself(file: Bytes, offset: int) -> bool:
     opcode, length = HEAD.unpack(file.exactly(offset, HEAD.size))
+    file.searched += _LONGEST_CHUNK_HEAD + (0 if opcode == Opcode.CHUNK else length)
     if opcode == Opcode.CHUNK:
         return _chunk_adds_up(file.read(offset + HEAD.size, min(length, _LONGEST_CHUNK_HEAD)), length)
     try:
@@ -199,7 +213,7 @@ def _chunk_adds_up(head: bytes, length: int) -> bool:
         return False
     (name_length,) = struct.unpack_from("<I", head, _CHUNK.size)
     at = _CHUNK.size + 4 + name_length
-    if name_length > 8 or at + 8 > len(head) or _CHUNK.unpack_from(head)[2] > MAX_CHUNK_BYTES:
+    if name_length > 8 or at + 8 > len(head) or _CHUNK.unpack_from(head)[2] > MOST_CHUNK_BYTES:
         return False
     return bool(at + 8 + struct.unpack_from("<Q", head, at)[0] == length)
 

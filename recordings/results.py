@@ -13,19 +13,19 @@ Reading a result needs nothing but this folder.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
-from zipfile import BadZipFile
 
 import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray as Array
 
 from recordings.codec import decode_mask
+from recordings.documents import read_json
 from recordings.errors import BadInput, DamagedFile
+from recordings.limits import open_npz, read_npy
 from recordings.session_writer import write_bytes, write_json
 from recordings.shape_file import read_shape, write_shape
 from recordings.tracks import ContactModel, ObjectShape, ObjectTrack, RigCalibration, Status
@@ -83,7 +83,7 @@ def read_track(folder: Path, toss: int) -> ObjectTrack:
     if not path.exists():
         raise BadInput(f"{folder} holds no track of toss {toss}; run toss-process again to make it")
     try:
-        with np.load(path, allow_pickle=False) as stored:
+        with open_npz(path) as stored:
             names = [str(n) for n in stored["status_names"]]
             return ObjectTrack(
                 toss=int(stored["toss"]),
@@ -94,7 +94,7 @@ def read_track(folder: Path, toss: int) -> ObjectTrack:
                 status=tuple(CODES[CODES.index(names[s])] for s in stored["status"]),
                 covariance=stored["covariance"].astype(np.float64),
             )
-    except (OSError, ValueError, KeyError, IndexError, EOFError, BadZipFile) as wrong:
+    except (OSError, ValueError, KeyError, IndexError, TypeError) as wrong:
         raise DamagedFile(f"{path} cannot be read ({wrong}); remove its folder and run toss-process again") from wrong
 
 
@@ -124,8 +124,8 @@ def read_hand(folder: Path, toss: int) -> Float[Array, "n 4 4"] | None:
     """What `write_hand` wrote; None where no robot is known. Raises BadInput where it cannot be read."""
     path = folder / f"{_stem(toss)}.hand.npy"
     try:
-        return np.load(path, allow_pickle=False) if path.exists() else None
-    except (OSError, ValueError, EOFError) as wrong:
+        return read_npy(path) if path.exists() else None
+    except (OSError, ValueError) as wrong:
         raise BadInput(f"{path} holds no poses of the hand ({wrong}); remove {folder} and run again") from wrong
 
 
@@ -351,12 +351,7 @@ class Results:
 
 
 def _read_json(path: Path) -> Mapping[str, Any]:
-    try:
-        document = json.loads(path.read_text())
-    except OSError as refused:
-        raise BadInput(f"{path} cannot be read ({refused.strerror}); run toss-process again to make it") from refused
-    except (json.JSONDecodeError, UnicodeDecodeError) as wrong:
-        raise DamagedFile(f"{path} is no readable JSON ({wrong}); remove it and run toss-process again") from wrong
+    document = read_json(path, "; remove it and run toss-process again to make it")
     if not isinstance(document, dict):
         raise DamagedFile(f"{path}: wanted a JSON object, found {type(document).__name__}")
     return document

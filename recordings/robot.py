@@ -19,7 +19,9 @@ from numpy import ndarray as Array
 
 from recordings.errors import BadInput
 from recordings.geometry import Transform, rotation_exp
+from recordings.limits import MOST_JOINTS
 from recordings.records import ArmStates
+from recordings.xml_file import read_xml
 
 PANDA_DISTRIBUTION = "example-robot-data"
 PANDA_URDF = "panda_description/urdf/panda.urdf"
@@ -178,15 +180,22 @@ def panda_urdf() -> Path:
 
 def read_urdf(path: Path) -> Robot:
     """A URDF whose `package://` meshes lie in a folder above it."""
+    tree = read_xml(path, "a URDF")
     try:
-        tree = ET.parse(path).getroot()
-    except (OSError, ET.ParseError) as wrong:
-        raise BadInput(f"{path}: cannot be read as a URDF ({wrong})") from wrong
-    joints = _in_order([_joint(node) for node in tree.findall("joint")])
+        return _robot(tree, path)
+    except (KeyError, ValueError) as wrong:
+        raise BadInput(f"{path}: cannot be read as a URDF ({type(wrong).__name__}: {wrong})") from wrong
+
+
+def _robot(tree: ET.Element, path: Path) -> Robot:
+    nodes = tree.findall("joint")
+    if len(nodes) > MOST_JOINTS:
+        raise BadInput(f"{path}: {len(nodes)} joints; wanted at most {MOST_JOINTS}")
+    joints = _in_order([_joint(node) for node in nodes])
     children = {j.child for j in joints}
     roots = [name for node in tree.findall("link") if (name := node.attrib["name"]) not in children]
     if len(roots) != 1:
-        raise BadInput(f"{path}: found {len(roots)} links without a parent ({', '.join(roots)}); wanted one base")
+        raise BadInput(f"{path}: found {len(roots)} links without a parent ({', '.join(roots[:5])}); wanted one base")
     meshes = [m for node in tree.findall("link") for m in _meshes(node, path)]
     return Robot(roots[0], tuple(joints), tuple(meshes))
 

@@ -9,6 +9,7 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Header, MessageIndex, Metadata, Schema, Statistics
 
 from recordings import mcap_scan
+from recordings.limits import Budget
 from recordings.mcap_scan import MESSAGE, Bytes, Record
 from recordings.mcap_writer import MAGIC
 
@@ -58,6 +59,7 @@ def survey(file: Bytes) -> Survey:
 
 def saved(file: Bytes, found: Survey) -> Iterator[SavedMessage | Attachment | Metadata]:
     """What can be kept, in the order of the file."""
+    budget = Budget(file.size)
     for offset in found.offsets:
         record = mcap_scan.record_at(file, offset)
         if record.opcode == Opcode.ATTACHMENT:
@@ -67,8 +69,8 @@ def saved(file: Bytes, found: Survey) -> Iterator[SavedMessage | Attachment | Me
         elif record.opcode == Opcode.MESSAGE:
             yield _message(record.body, compressed=False)
         else:
-            chunk = mcap_scan.parse_chunk(record)
-            for opcode, _, body in mcap_scan.chunk_records(chunk.raw):
+            chunk = mcap_scan.parse_chunk(record, budget)
+            for opcode, _, body in mcap_scan.chunk_records(chunk.raw, budget):
                 if opcode == Opcode.MESSAGE:
                     yield _message(body, compressed=chunk.compression != "")
 
@@ -77,6 +79,7 @@ class _Walk:
     def __init__(self, file: Bytes) -> None:
         self.file = file
         self.found = Survey()
+        self.budget = Budget(file.size)
         self.chunks = 0
         self.messages = 0
         self.after_bad_chunk = False
@@ -188,11 +191,11 @@ class _Walk:
         self.messages += 1
 
     def _chunk(self, record: Record) -> None:
-        chunk = mcap_scan.parse_chunk(record)
+        chunk = mcap_scan.parse_chunk(record, self.budget)
         if chunk.crc == 0 and self.found.profile == "tosslab":
             raise ValueError("a chunk without its CRC, which tosslab always writes")
         definitions: list[Schema | Channel] = []
-        for opcode, _, body in mcap_scan.chunk_records(chunk.raw):
+        for opcode, _, body in mcap_scan.chunk_records(chunk.raw, self.budget):
             if opcode == Opcode.SCHEMA:
                 definitions.append(mcap_scan.parse(body, Schema))
             elif opcode == Opcode.CHANNEL:

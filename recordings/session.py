@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar, overload
 
 import numpy as np
-from jaxtyping import Bool, Float32, Int64
+from jaxtyping import Float32, Int64
 from numpy import ndarray as Array
 
 from recordings import arm_codec, codec, sync
@@ -25,6 +25,7 @@ from recordings.documents import (
 )
 from recordings.errors import BadInput, DamagedFile
 from recordings.geometry import CameraModel
+from recordings.given_masks import GivenMasks
 from recordings.mcap_file import McapFile, Message
 from recordings.records import (
     ArmStates,
@@ -194,13 +195,9 @@ class Toss:
         missing = tuple(int(i) for i in np.flatnonzero(~paired))
         return RgbdFrames(colors.times_ns, load, depth_times_ns, missing, len(depths) - int(paired.sum()))
 
-    def masks(self) -> dict[int, Bool[Array, "h w"]]:
+    def masks(self) -> GivenMasks:
         """Given masks of the object by position of the colour frame in the toss."""
-        found = {}
-        for name in self.file.attachments():
-            if name.startswith("masks/") and name.endswith(".png") and name[6:-4].isdigit():
-                found[int(name[6:-4])] = codec.decode_mask(self.file.attachment(name) or b"", name)
-        return found
+        return GivenMasks(self.file)
 
     def arm_states(self) -> ArmStates | None:
         messages = [m.data for m in self.file.messages(arm_codec.TOPIC)]

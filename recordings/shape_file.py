@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Int
 from numpy import ndarray as Array
 
+from recordings.documents import read_json
 from recordings.errors import BadInput, DamagedFile
 from recordings.session_writer import write_bytes, write_json
 from recordings.tracks import ObjectShape
@@ -49,21 +49,21 @@ def read_shape(folder: Path, name: str = "shape") -> ObjectShape:
     """Read a shape that `write_shape` wrote. Raises BadInput where there is none, DamagedFile where it is broken."""
     path = folder / f"{name}.ply"
     try:
-        data, about = path.read_bytes(), json.loads((folder / f"{name}.json").read_text())
+        data = path.read_bytes()
     except OSError as refused:
         raise BadInput(f"{folder} holds no {name}.ply ({refused.strerror}); run toss-process again") from refused
-    except (json.JSONDecodeError, UnicodeDecodeError) as wrong:
-        raise DamagedFile(f"{folder / name}.json is no readable JSON ({wrong})") from wrong
+    about = read_json(folder / f"{name}.json", "; remove its folder and run toss-process again")
     try:
         end = data.index(b"end_header\n") + len(b"end_header\n")
         counts = [int(line.split()[2]) for line in data[:end].decode().splitlines() if line.startswith("element")]
         vertices = np.frombuffer(data, VERTEX, counts[0], end)
         faces = np.frombuffer(data, FACE, counts[1], end + vertices.nbytes)
-    except (ValueError, IndexError, UnicodeDecodeError) as wrong:
+        object_frame, source = str(about["object_frame"]), str(about["source"])
+    except (ValueError, IndexError, KeyError, TypeError) as wrong:
         raise DamagedFile(f"{path} is damaged ({wrong}); remove its folder and run toss-process again") from wrong
     return ObjectShape(
-        object_frame=str(about["object_frame"]),
-        source=str(about["source"]),
+        object_frame=object_frame,
+        source=source,
         vertices_m=vertices["xyz"].copy(),
         faces=faces["abc"].astype(np.int64),
         vertex_rgb=vertices["rgb"].copy() if about.get("has_colour") else None,

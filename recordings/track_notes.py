@@ -14,13 +14,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray as Array
 
 from recordings.errors import BadInput, DamagedFile
+from recordings.limits import open_npz
 from recordings.results import Results
 from recordings.session_writer import write_bytes
 
@@ -100,9 +100,9 @@ def _arrays(path: Path) -> Mapping[str, Any]:
     if not path.exists():
         return {}
     try:
-        with np.load(path, allow_pickle=False) as stored:
+        with open_npz(path) as stored:
             return {name: stored[name] for name in stored.files}
-    except (OSError, ValueError, EOFError, BadZipFile) as wrong:
+    except (OSError, ValueError) as wrong:
         raise DamagedFile(f"{path} cannot be read ({wrong}); remove its folder and run toss-process again") from wrong
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Int64, UInt8
 from numpy import ndarray as Array
 
+from recordings.documents import read_json
 from recordings.errors import BadInput
 from recordings.geometry import CameraModel, Transform
 
@@ -180,10 +180,7 @@ class RigCalibration:
 
     @staticmethod
     def read(path: Path) -> RigCalibration:
-        try:
-            data = json.loads(path.read_text())
-        except (OSError, json.JSONDecodeError, UnicodeDecodeError) as wrong:
-            raise BadInput(f"{path}: cannot be read as a calibration ({wrong})") from wrong
+        data = read_json(path)
         if not isinstance(data, dict):
             raise BadInput(f"{path}: cannot be read as a calibration (wanted a JSON object, found {str(data)[:40]})")
         return RigCalibration.from_json(data)

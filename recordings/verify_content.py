@@ -9,10 +9,11 @@ import numpy as np
 from jaxtyping import Float, Int64
 from numpy import ndarray as Array
 
-from recordings import codec, sync
+from recordings import codec, limits, sync
 from recordings.errors import TosslabError
 from recordings.geometry import CameraModel
-from recordings.records import DepthImage
+from recordings.given_masks import GivenMasks
+from recordings.records import DepthImage, EncodedImage
 from recordings.session import PAIR_WITHIN_PERIODS, Toss
 from recordings.verify_structure import Finding, Severity, TopicSeen
 
@@ -21,6 +22,8 @@ UNITS_M = (0.001, 0.00025, 0.0001)
 PLAUSIBLE_DEPTH_M = (0.15, 3.0)
 LOOKED_AT = 5
 """Images of a stream that are decoded; their sizes and depths stand for all."""
+LOOKED_AT_PIXELS = 1_000_000_000
+"""Of all images and masks of a toss."""
 WRAP_US_NS = (1 << 32) * 1000
 NUMBERED = ("color", "image", "depth", "joint_states")
 
@@ -41,6 +44,7 @@ def check_content(toss: Toss, topics: dict[str, TopicSeen], place: str) -> list[
 class _Content:
     def __init__(self, toss: Toss, topics: dict[str, TopicSeen], place: str) -> None:
         self.toss, self.topics, self.place = toss, topics, place
+        self.pixels_left = LOOKED_AT_PIXELS
 
     def run(self) -> Iterator[Finding]:
         for topic, seen in sorted(self.topics.items()):
@@ -50,6 +54,9 @@ class _Content:
         for camera in self.toss.cameras():
             yield from self._camera(camera)
         yield from self._masks()
+        if self.pixels_left < 0:
+            text = f"its images are so many and so large that not all were decoded; {LOOKED_AT_PIXELS} pixels were"
+            yield self._finding("warning", text)
 
     def _finding(self, severity: Severity, text: str) -> Finding:
         return Finding(severity, self.place, text)
@@ -110,6 +117,8 @@ class _Content:
             (f"/{camera}/image", self.toss.mono(camera)),
         ):
             for i in _spread(len(frames)):
+                if not self._may_look(frames[i].width * frames[i].height):
+                    return
                 try:
                     pixels = codec.decode_image(frames[i])
                 except TosslabError as wrong:
@@ -234,13 +243,9 @@ class _Content:
         return Plausibility(float(np.median(joined)), len(joined)) if len(joined) > 500 else None
 
     def _masks(self) -> Iterator[Finding]:
-        try:
-            masks = self.toss.masks()
-        except TosslabError as wrong:
-            yield self._finding("error", str(wrong))
-            return
+        masks = self.toss.masks()
         cameras = [c for c in self.toss.cameras() if f"/{c}/color" in self.topics]
-        for position, mask in masks.items():
+        for position in masks:
             frames = self.toss.color(cameras[0]) if cameras else None
             if frames is None or position >= len(frames):
                 text = (
@@ -248,12 +253,23 @@ class _Content:
                 )
                 yield self._finding("error", text)
                 continue
-            size = (frames[position].height, frames[position].width)
-            if mask.shape != size:
-                text = f"the mask of frame {position} is {mask.shape[1]}x{mask.shape[0]}, the image {size[1]}x{size[0]}"
-                yield self._finding("error", text)
-            elif not mask.any():
+            yield from self._mask(position, masks, frames[position])
+
+    def _mask(self, position: int, masks: GivenMasks, image: EncodedImage) -> Iterator[Finding]:
+        try:
+            found = limits.image_size(masks.png(position))
+            if found is not None and found != (image.width, image.height):
+                text = f"{found[0]}x{found[1]}, the image {image.width}x{image.height}"
+                yield self._finding("error", f"the mask of frame {position} is {text}")
+            elif self._may_look(image.width * image.height) and not masks[position].any():
                 yield self._finding("warning", f"the mask of frame {position} is empty")
+        except TosslabError as wrong:
+            yield self._finding("error", str(wrong))
+
+    def _may_look(self, pixels: int) -> bool:
+        """Whether so many more pixels are decoded: every image of a lab's toss, not every image of a file of blanks."""
+        self.pixels_left -= pixels
+        return self.pixels_left >= 0
 
 
 def _plane_depth(lens: CameraModel, normal: Float[Array, "3"], height_m: float) -> Float[Array, "h w"]:

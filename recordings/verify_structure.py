@@ -26,6 +26,7 @@ from mcap.records import (
 
 from recordings import mcap_scan
 from recordings.errors import BadInput
+from recordings.limits import Budget
 from recordings.mcap_scan import MESSAGE, Bytes, Record
 from recordings.mcap_writer import MAGIC
 
@@ -99,6 +100,7 @@ class _Pass:
 
     def __init__(self, file: Bytes, seen: Structure) -> None:
         self.file, self.seen = file, seen
+        self.budget = Budget(file.size)
         self.crc, self.sha256 = 0, hashlib.sha256()
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}
@@ -182,10 +184,10 @@ class _Pass:
 
     def _chunk(self, record: Record) -> None:
         try:
-            chunk = mcap_scan.parse_chunk(record)
+            chunk = mcap_scan.parse_chunk(record, self.budget)
             self.seen.chunks += 1
             index: dict[int, list[tuple[int, int]]] = {}
-            for opcode, at, body in mcap_scan.chunk_records(chunk.raw):
+            for opcode, at, body in mcap_scan.chunk_records(chunk.raw, self.budget):
                 stamp = self._inner(opcode, body)
                 if stamp is not None:
                     index.setdefault(stamp[0], []).append((stamp[1], at))

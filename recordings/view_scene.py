@@ -14,6 +14,7 @@ from numpy import ndarray as Array
 from recordings.cycle_steps import TossCycle, read_cycle
 from recordings.errors import BadInput
 from recordings.geometry import Transform
+from recordings.mesh_file import load_mesh
 from recordings.records import StampedPose
 from recordings.results import Masks, Results, VariantRecord, read_masks
 from recordings.session import Session, Toss
@@ -186,16 +187,9 @@ def pose_topics(toss: Toss) -> tuple[str, ...]:
 
 def read_mesh(path: Path, object_frame: str, source: str) -> ObjectShape:
     """A mesh file (.obj, .ply, .stl) in metres. Raises BadInput where it cannot be read or has no triangles."""
-    import trimesh
-
-    try:
-        mesh = trimesh.load(path, force="mesh", process=False)
-    except Exception as wrong:  # trimesh's loaders raise what they like
-        raise BadInput(f"{path}: cannot be read as a mesh ({wrong})") from wrong
-    faces = getattr(mesh, "faces", None)
-    if faces is None or len(faces) == 0:
-        raise BadInput(f"{path}: holds no triangles; wanted a mesh")
-    return ObjectShape(object_frame, source, np.array(mesh.vertices, dtype=np.float64), np.array(faces, dtype=np.int64))
+    mesh = load_mesh(path)
+    vertices_m, faces = np.array(mesh.vertices, dtype=np.float64), np.array(mesh.faces, dtype=np.int64)
+    return ObjectShape(object_frame, source, vertices_m, faces)
 
 
 def root_poses(scene: Scene, poses: Sequence[StampedPose]) -> tuple[Int64[Array, " n"], Float[Array, "n 4 4"]]:

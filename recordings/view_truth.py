@@ -5,7 +5,6 @@ The layers are what `toss-truth` leaves in truth/tags/: cameras.json, and toss_X
 
 from __future__ import annotations
 
-import json
 from typing import Any
 
 import numpy as np
@@ -13,8 +12,10 @@ import rerun as rr
 from jaxtyping import Float
 from numpy import ndarray as Array
 
+from recordings.documents import read_json
 from recordings.errors import DamagedFile
 from recordings.geometry import quaternion_from_rotation
+from recordings.limits import open_npz
 from recordings.view_layers import Clock, image_entity
 from recordings.view_scene import Scene
 
@@ -34,9 +35,9 @@ def log_truth(clock: Clock, scene: Scene) -> None:
     if folder is None or file is None or not file.exists() or scene.root != "world":
         return
     try:
-        with np.load(file, allow_pickle=False) as stored:
+        with open_npz(file) as stored:
             data = {name: stored[name] for name in stored.files}
-        cameras = json.loads((folder / "tags" / "cameras.json").read_text())
+        cameras = read_json(folder / "tags" / "cameras.json")
         log_tags(clock, scene, data, cameras["names"])
         log_cameras(clock, scene, cameras["cameras"])
         log_path_sigma(clock, scene, data)

@@ -51,7 +51,7 @@ def export_bundlesdf(
     return ExportReport("bundlesdf", out, files, tuple(dict.fromkeys(notes)))
 
 
-def _as_mapping(masks: Sequence[Bool[Array, "h w"]]) -> dict[int, Bool[Array, "h w"]]:
+def _as_mapping(masks: Sequence[Bool[Array, "h w"]]) -> Mapping[int, Bool[Array, "h w"]]:
     return {i: masks[i] for i in range(len(masks))}
 
 

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Int64
 from numpy import ndarray as Array
 
+from recordings.documents import parse_json
 from recordings.errors import BadInput
 from recordings.session_writer import SessionWriter
 from recordings.tracks import RigCalibration
@@ -120,10 +121,7 @@ def read_text(path: Path) -> str:
 
 def read_json_object(path: Path) -> dict[str, Any]:
     """A JSON file that holds an object. Raises BadInput."""
-    try:
-        document = json.loads(read_text(path))
-    except json.JSONDecodeError as wrong:
-        raise BadInput(f"{path} is no readable JSON ({wrong})") from wrong
+    document = parse_json(read_text(path), str(path))
     if not isinstance(document, dict):
         raise BadInput(f"{path}: wanted a JSON object, found {type(document).__name__}")
     return document

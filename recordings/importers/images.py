@@ -8,20 +8,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-import cv2
 import numpy as np
 from jaxtyping import Bool, UInt16
 from numpy import ndarray as Array
 
-from recordings.codec import decode_mask
+from recordings.codec import decode_mask, decode_pixels
 from recordings.errors import BadInput
 from recordings.geometry import CameraModel
 from recordings.importers.common import read_bytes
+from recordings.limits import jpeg_frame
 from recordings.records import EncodedImage
 
 PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
-_START_OF_FRAME = {0xC0, 0xC1, 0xC2, 0xC3, 0xC5, 0xC6, 0xC7, 0xC9, 0xCA, 0xCB, 0xCD, 0xCE, 0xCF}
 _PNG_CHANNELS = {0: 1, 2: 3, 3: 3, 4: 2, 6: 4}
 
 
@@ -67,17 +66,11 @@ def _png_header(data: bytes, name: str) -> Header:
 def _jpeg_header(data: bytes, name: str) -> Header:
     if b"\xff\xd9" not in data[-4096:]:
         raise BadInput(f"{name} was cut off: it is a JPEG without its end mark; restore this image from its source")
-    at = 2
-    while at + 9 < len(data) and data[at] == 0xFF:
-        marker = data[at + 1]
-        if marker == 0xFF or 0xD0 <= marker <= 0xD8 or marker == 0x01:  # fill bytes and marks without a body
-            at += 1 if marker == 0xFF else 2
-            continue
-        if marker in _START_OF_FRAME:
-            bits, height, width, channels = struct.unpack_from(">BHHB", data, at + 4)
-            return Header("jpeg", width, height, channels, bits)
-        at += 2 + struct.unpack_from(">H", data, at + 2)[0]
-    raise BadInput(f"{name} is damaged: a JPEG without a frame header; restore this image from its source")
+    at = jpeg_frame(data)
+    if at is None:
+        raise BadInput(f"{name} is damaged: a JPEG without a frame header; restore this image from its source")
+    bits, height, width, channels = struct.unpack_from(">BHHB", data, at + 4)
+    return Header("jpeg", width, height, channels, bits)
 
 
 def read_encoded(
@@ -105,7 +98,7 @@ def read_depth_png(path: Path) -> UInt16[Array, "h w"]:
         raise BadInput(
             f"{path}: {header.encoding} with {header.channels} channels of {header.bits} bits; wanted a 16-bit grey PNG"
         )
-    raw = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
+    raw = decode_pixels(data, str(path))
     if raw is None or raw.dtype != np.uint16 or raw.shape != (header.height, header.width):
         raise BadInput(f"{path} cannot be decoded as a 16-bit PNG; restore this image from its source")
     return raw
@@ -114,11 +107,10 @@ def read_depth_png(path: Path) -> UInt16[Array, "h w"]:
 def read_mask(path: Path, width: int, height: int) -> Bool[Array, "h w"]:
     """A mask image (any value above 0 is inside) of a given size. Raises BadInput."""
     data = read_bytes(path)
-    read_header(data, str(path))
-    mask = decode_mask(data, str(path))
-    if mask.shape != (height, width):
+    header = read_header(data, str(path))
+    if (header.width, header.height) != (width, height):
         raise BadInput(
-            f"{path} is {mask.shape[1]}x{mask.shape[0]}, the colour images are {width}x{height}; "
+            f"{path} is {header.width}x{header.height}, the colour images are {width}x{height}; "
             "wanted a mask of the colour images' size"
         )
-    return mask
+    return decode_mask(data, str(path))

@@ -139,6 +139,7 @@ def _check_file(source: Path) -> None:
     wanted = b"#ROSBAG" if source.suffix == ".bag" else b"SQLite format 3\0"
     if not start.startswith(wanted):
         raise BadInput(f"{source} begins with {start[:8]!r}; wanted {wanted!r}, as a {source.suffix} recording does")
+    recorded(source)  # what the SDK is given is known to hold images
 
 
 def _sdk() -> Any:

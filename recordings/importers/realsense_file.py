@@ -41,10 +41,13 @@ def recorded(path: Path) -> Recorded:
 
 def _rows_of_db3(path: Path) -> list[tuple[str, int, int]]:
     """(topic, count, place of its first message)."""
+    from recordings.importers.ros_bounds import check_sqlite
+
     query = (
         "select t.name, count(*), min(m.timestamp) from messages m join topics t on t.id = m.topic_id group by t.name"
     )
     try:
+        check_sqlite(path)
         with closing(sqlite3.connect(f"file:{path}?mode=ro", uri=True)) as database:
             return [(str(name), int(count), int(first)) for name, count, first in database.execute(query)]
     except sqlite3.Error as wrong:
@@ -52,11 +55,11 @@ def _rows_of_db3(path: Path) -> list[tuple[str, int, int]]:
 
 
 def _rows_of_bag(path: Path) -> Iterable[tuple[str, int, int]]:
-    from rosbags.rosbag1 import Reader
+    from recordings.importers.ros_bounds import BoundedBag1
 
     rows: dict[str, tuple[str, int, int]] = {}
     try:
-        with Reader(path) as bag:
+        with BoundedBag1(path) as bag:
             images = [c for c in bag.connections if IMAGES.match(c.topic)]
             for order, (connection, _, _) in enumerate(bag.messages(connections=images)):
                 _, count, first = rows.get(connection.topic, ("", 0, order))

@@ -26,15 +26,20 @@ class Bag:
         self.path = path
         if not path.exists():
             raise BadInput(f"{path} does not exist; wanted a ROS bag: .bag, a folder with metadata.yaml, .mcap or .db3")
-        from rosbags.rosbag1 import Reader as Reader1
         from rosbags.rosbag2 import Reader as Reader2
         from rosbags.typesys import Stores, get_typestore
+
+        from recordings.importers.ros_bounds import BoundedBag1, check_bag2
 
         self._is_ros1 = path.suffix == ".bag"
         self._typestore = get_typestore(Stores.ROS1_NOETIC if self._is_ros1 else Stores.ROS2_HUMBLE)
         try:
-            self._reader: Any = Reader1(path) if self._is_ros1 else Reader2(path)
+            if not self._is_ros1:
+                check_bag2(path)
+            self._reader: Any = BoundedBag1(path) if self._is_ros1 else Reader2(path)
             self._reader.open()
+        except BadInput:
+            raise
         except Exception as wrong:  # rosbags raises its own, the decompressors', yaml's and sqlite's errors
             raise BadInput(
                 f"{path} cannot be read as a bag of ROS 1, or of ROS 2 in cdr: {_one_line(wrong)}"

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Int64, UInt16
 from numpy import ndarray as Array
 
+from recordings.codec import decode_pixels
 from recordings.errors import BadInput
 from recordings.importers.common import Warnings
 from recordings.importers.images import PNG_MAGIC, read_header
@@ -99,15 +100,13 @@ def depth_image(message: Any, path: Path, topic: str, float_unit_m: float) -> tu
 
 
 def _compressed_depth(message: Any, path: Path, topic: str) -> UInt16[Array, "h w"]:
-    import cv2
-
     data = bytes(message.data)
     if "compressedDepth" in message.format and not data.startswith(PNG_MAGIC):
         data = data[COMPRESSED_DEPTH_HEAD:]
     header = read_header(data, f"{path.name}: an image of {topic}")
     if "32FC1" in message.format or header.encoding != "png" or (header.bits, header.channels) != (16, 1):
         raise BadInput(f"{path}: {topic} is '{message.format}'; wanted 16-bit PNG depth in millimetres")
-    raw = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
+    raw = decode_pixels(data, f"{path.name}: an image of {topic}")
     if raw is None or raw.dtype != np.uint16:
         raise BadInput(f"{path}: an image of {topic} cannot be decoded as a 16-bit PNG")
     return raw

@@ -9,6 +9,7 @@ imported. Both containers are read: the zip archive of torch 1.6 and later, and 
 from __future__ import annotations
 
 import io
+import math
 import pickletools
 import struct
 import zipfile
@@ -22,6 +23,7 @@ from numpy import ndarray as Array
 
 from recordings.errors import BadInput
 from recordings.importers.common import read_bytes
+from recordings.limits import MOST_TENSOR_STEPS
 
 STORAGES = {
     "DoubleStorage": "<f8",
@@ -88,6 +90,8 @@ def _read_zip(data: bytes) -> Array:
     names = archive.namelist()
     if any(entry.compress_type != zipfile.ZIP_STORED or entry.flag_bits & 1 for entry in archive.infolist()):
         raise _Refused("a compressed or encrypted archive, which torch.save never writes")
+    if sum(entry.file_size for entry in archive.infolist()) > len(data):
+        raise _Refused("its entries lie over one another")
     if archive.testzip() is not None:
         raise _Refused("a checksum in it differs: the file is damaged")
     pickles = [n for n in names if n == "data.pkl" or n.endswith("/data.pkl")]
@@ -136,6 +140,8 @@ def _build(tensor: Any, read: Callable[[_Storage], bytes]) -> Array:
     last = tensor.offset + sum((n - 1) * s for n, s in zip(tensor.shape, tensor.stride, strict=True))
     if last >= len(numbers):
         raise _Refused("the tensor reaches beyond its storage")
+    if math.prod(tensor.shape) > len(numbers):
+        raise _Refused(f"a tensor of {math.prod(tensor.shape)} numbers in a storage of {len(numbers)}")
     strides = tuple(s * dtype.itemsize for s in tensor.stride)
     view = np.lib.stride_tricks.as_strided(numbers[tensor.offset :], tensor.shape, strides, writeable=False)
     return np.array(view)
@@ -145,8 +151,10 @@ def _walk(stream: io.BytesIO) -> Any:
     """Walk one pickle of the stream and return what it describes: plain values, _Storage or _Tensor."""
     stack: list[Any] = []
     memo: dict[int, Any] = {}
-    for opcode, argument, _ in pickletools.genops(stream):
+    for step, (opcode, argument, _) in enumerate(pickletools.genops(stream)):
         name = opcode.name
+        if step > MOST_TENSOR_STEPS:
+            raise _Refused(f"its pickle has more than {MOST_TENSOR_STEPS} steps")
         if name == "STOP":
             if len(stack) != 1:
                 raise _Refused("its pickle does not end in one value")

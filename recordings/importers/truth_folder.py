@@ -13,6 +13,7 @@ from numpy import ndarray as Array
 
 from recordings.errors import BadInput, WriteFailed
 from recordings.importers.common import Warnings, read_bytes, read_json_object
+from recordings.limits import open_npz
 from recordings.records import StampedPose
 from recordings.session_writer import toss_name, write_truth
 
@@ -61,11 +62,11 @@ def _read_toss(folder: Path) -> TrueToss:
     path = folder / "poses_camera_object.npz"
     read_bytes(path)  # says plainly when it is missing, empty or not to be read
     try:
-        with np.load(path, allow_pickle=False) as stored:
+        with open_npz(path) as stored:
             time_s = stored["t"].reshape(-1).astype(np.float64)
             world, d455 = (stored[k].astype(np.float64) for k in ("T_world_object", "T_camera_object"))
             phase = tuple(str(p) for p in stored["phase"]) if "phase" in stored else ()
-    except (OSError, ValueError, KeyError, EOFError) as wrong:
+    except (OSError, ValueError, KeyError) as wrong:
         raise BadInput(f"{path}: {wrong}; wanted t, T_camera_object and T_world_object") from wrong
     if world.shape != (len(time_s), 4, 4) or d455.shape != world.shape:
         raise BadInput(
