@@ -1,13 +1,24 @@
-"""Many sessions: each in a process of its own, on this machine or on a Slurm cluster (submitit)."""
+"""Many sessions: each in a process of its own, on this machine or on a Slurm cluster (submitit).
+
+A job is done when its own marker, a file written last and renamed, is there; one that has left Slurm's queue without it
+ended without a result. The queue itself is asked (`squeue`), so that a cluster needs no accounting. A job whose node
+fails is queued again by Slurm, and goes on where its finished stages end.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import json
+import logging
+import subprocess
 import time
-from collections.abc import Callable, Sequence
+import uuid
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from recordings.documents import read_json
 from recordings.errors import BadInput
 
 if TYPE_CHECKING:
@@ -17,7 +28,25 @@ Where = Literal["local", "slurm"]
 AT_ONCE = 1
 """Local processes at a time: one session keeps two cores busy."""
 POLL_S = 0.5
+QUEUE_POLL_S = 3.0
+"""Slurm's controller is asked this often, once for all jobs."""
+MARKER_WAIT_S = 15.0
+"""A shared disk may show a marker this much later than Slurm shows the job's end."""
 HOURS = 8
+ENDED = [
+    "BOOT_FAIL",
+    "CANCELLED",
+    "COMPLETED",
+    "DEADLINE",
+    "FAILED",
+    "NODE_FAIL",
+    "OUT_OF_MEMORY",
+    "PREEMPTED",
+    "REVOKED",
+    "TIMEOUT",
+    "GONE",
+]
+"""Slurm's words for a job that will not run again; GONE is ours, for one that the queue has forgotten."""
 
 
 @dataclass(frozen=True)
@@ -29,50 +58,117 @@ class Task:
     arguments: tuple[Any, ...]
 
 
+@dataclass
+class _Running:
+    """A job, its marker, how late that may be seen, and since when the job is known to have ended without one."""
+
+    job: Any
+    marker: Path
+    wait_s: float
+    ended_s: float | None = None
+
+
 def run_all(
     work: Callable[..., dict[str, Any]], tasks: Sequence[Task], where: Where, progress: Progress
 ) -> list[dict[str, Any]]:
     """`work(*arguments)` of every task, in their order. One that fails gives `{"error": why}` and stops no other.
 
-    Raises BadInput where Slurm is asked for and not there.
+    What `work` gives must be a JSON object. Raises BadInput where Slurm is asked for and not there.
     """
     import submitit
 
+    logging.getLogger("submitit").setLevel(logging.ERROR)
     if where == "slurm" and submitit.SlurmExecutor.affinity() < 0:
         raise BadInput(
             "--executor slurm: `srun` is not on this machine; run on a Slurm login node, or --executor local"
         )
-    waiting, running, results = list(enumerate(tasks)), dict[int, Any](), dict[int, dict[str, Any]]()
+    waiting, running, results = list(enumerate(tasks)), dict[int, _Running](), dict[int, dict[str, Any]]()
     limit = len(tasks) if where == "slurm" else AT_ONCE
+    ended: Callable[[Mapping[int, _Running]], set[int]] = _Queue().ended if where == "slurm" else _ended_here
     try:
         while len(results) < len(tasks):
             while waiting and len(running) < limit:
                 k, task = waiting.pop(0)
-                running[k] = _executor(where, task).submit(work, *task.arguments)
-            for k in [k for k, job in running.items() if job.done()]:
+                running[k] = _submit(work, task, where)
+            for k in _done(running, ended(running)):
                 results[k] = _result(running.pop(k), tasks[k])
                 progress.step(len(results), len(tasks), tasks[k].name)
             time.sleep(POLL_S)
     except KeyboardInterrupt:
-        for job in running.values():
-            job.cancel()
+        for one in running.values():
+            one.job.cancel(check=False)
         raise
     return [results[k] for k in range(len(tasks))]
 
 
-def _executor(where: Where, task: Task) -> Any:
+def _submit(work: Callable[..., dict[str, Any]], task: Task, where: Where) -> _Running:
     import submitit
 
     task.logs.mkdir(parents=True, exist_ok=True)
     executor = submitit.AutoExecutor(folder=task.logs, cluster=where)
     executor.update_parameters(timeout_min=60 * HOURS, cpus_per_task=2, mem_gb=8, name="tosslab")
-    return executor
+    if where == "slurm":
+        executor.update_parameters(slurm_additional_parameters={"requeue": True})
+    marker = task.logs / f"{uuid.uuid4().hex}.done.json"
+    wait_s = MARKER_WAIT_S if where == "slurm" else 0.0
+    return _Running(executor.submit(_marked, work, task.arguments, marker), marker, wait_s)
 
 
-def _result(job: Any, task: Task) -> dict[str, Any]:
+def _marked(work: Callable[..., dict[str, Any]], arguments: tuple[Any, ...], marker: Path) -> None:
+    """In the job's process: the work, then its result as the marker, whole or not there."""
+    partial = marker.with_suffix(".partial")
+    partial.write_text(json.dumps(work(*arguments)))
+    partial.replace(marker)
+
+
+def _done(running: Mapping[int, _Running], ended: set[int]) -> list[int]:
+    """Jobs with a marker, and those that ended long enough ago that none will come."""
+    now_s, done = time.monotonic(), []
+    for k, one in running.items():
+        one.ended_s = (one.ended_s or now_s) if k in ended else None
+        if one.marker.exists() or (one.ended_s is not None and now_s - one.ended_s >= one.wait_s):
+            done.append(k)
+    return done
+
+
+def _ended_here(running: Mapping[int, _Running]) -> set[int]:
+    return {k for k, one in running.items() if one.job.done()}
+
+
+class _Queue:
+    """Slurm's queue, asked every few seconds; what it cannot say for a while changes nothing."""
+
+    def __init__(self) -> None:
+        self._asked_s = float("-inf")
+        self._states: dict[str, str] = {}
+
+    def ended(self, running: Mapping[int, _Running]) -> set[int]:
+        if time.monotonic() - self._asked_s >= QUEUE_POLL_S and running:
+            self._asked_s = time.monotonic()
+            self._states = self._ask([one.job.job_id for one in running.values()])
+        return {k for k, one in running.items() if self._states.get(one.job.job_id) in ENDED}
+
+    def _ask(self, jobs: Sequence[str]) -> dict[str, str]:
+        """State by job number, GONE for those the queue does not know; the last states where it does not answer."""
+        command = ["squeue", "--noheader", "--states=all", "--format=%A %T", f"--jobs={','.join(jobs)}"]
+        try:
+            answer = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+        except (OSError, subprocess.TimeoutExpired):
+            return self._states
+        if answer.returncode != 0 and "Invalid job id" not in answer.stderr:
+            return self._states
+        told = dict(line.split()[:2] for line in answer.stdout.splitlines() if len(line.split()) >= 2)
+        return {job: told.get(job, "GONE") for job in jobs}
+
+
+def _result(one: _Running, task: Task) -> dict[str, Any]:
     """What the job gave, or the last line of why it did not."""
-    why = job.exception()
-    if why is None:
-        return dict(job.result())
-    last = str(why).strip().splitlines()[-1] if str(why).strip() else type(why).__name__
-    return {"error": f"the process ended without a result ({last}); its log is in {task.logs}"}
+    if one.marker.exists():
+        result = dict(read_json(one.marker))
+        one.marker.unlink()
+        return result
+    last = ""
+    with contextlib.suppress(OSError):
+        last = (one.job.paths.stderr.read_text(errors="replace").strip().splitlines() or [""])[-1]
+    why = f" ({last[:300]})" if last else ""
+    return {"error": f"the process ended without a result{why}; its log is in {task.logs}"}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import bz2
+import hashlib
 import io
 import json
 import sqlite3
@@ -206,14 +207,12 @@ def _text(text: str) -> bytes:
     return struct.pack("<I", len(text)) + text.encode()
 
 
-def mcap(path: Path, packed: list[tuple[str, int, bytes]], schema: str = "s") -> None:
+def mcap(path: Path, packed: list[tuple[str, int, bytes]], schema: str = "sensor_msgs/msg/Image") -> None:
     """An indexed MCAP file of these chunks: (compression, declared size, bytes)."""
-    definitions = _record(3, struct.pack("<H", 1) + _text(schema) + _text("protobuf") + struct.pack("<I", 0))
-    definitions += _record(
-        4, struct.pack("<HH", 1, 1) + _text("/d455/color") + _text("protobuf") + struct.pack("<I", 0)
-    )
+    definitions = _record(3, struct.pack("<H", 1) + _text(schema) + _text("ros2msg") + _text("uint8 a"))
+    definitions += _record(4, struct.pack("<HH", 1, 1) + _text("/d455/color") + _text("cdr") + struct.pack("<I", 0))
     out = io.BytesIO()
-    out.write(MAGIC + _record(1, _text("") + _text("hostile")) + definitions)
+    out.write(MAGIC + _record(1, _text("ros2") + _text("hostile")) + definitions)
     places = []
     for compression, size, data in packed:
         chunk = _record(
@@ -269,7 +268,7 @@ def huge_chunk(path: Path) -> None:
 
 def decoys(path: Path) -> None:
     """Every nine bytes begin what might be an attachment as long as the rest of the file."""
-    count = MOST // 9
+    count = (MOST - 8) // 9
     path.write_bytes(MAGIC + b"".join(struct.pack("<BQ", 9, (count - i) * 9 - 9) for i in range(count)))
 
 
@@ -287,7 +286,11 @@ def _ros1_record(fields: dict[str, bytes], data: bytes) -> bytes:
 
 def ros1_bag(path: Path, compression: str, packed: bytes, declared: int, topic: str = "/camera/image") -> None:
     """A bag of ROS 1 with one chunk, its index naming one message at the chunk's start."""
-    about = {"topic": topic.encode(), "type": b"sensor_msgs/Image", "md5sum": b"060021388200f6f0f447d0fcd9c64743"}
+    about = {
+        "topic": topic.encode(),
+        "type": b"sensor_msgs/Image",
+        "md5sum": hashlib.md5(b"uint8 a").hexdigest().encode(),
+    }
     about["message_definition"] = b"uint8 a"
     content = b"".join(struct.pack("<I", len(k) + 1 + len(v)) + k.encode() + b"=" + v for k, v in about.items())
     connection = _ros1_record({"op": b"\x07", "conn": bytes(4), "topic": topic.encode()}, content)
@@ -347,6 +350,3 @@ def bundlesdf_layout(path: Path, image: bytes) -> None:
         (path / name).mkdir(parents=True)
         (path / name / "000000.png").write_bytes(image)
     (path / "cam_K.txt").write_text("600 0 320 0 600 240 0 0 1")
-
-
-Maker = Callable[[Path], None]
