@@ -12,7 +12,6 @@ import queue
 import struct
 import subprocess
 import sys
-import zipfile
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -30,6 +29,7 @@ from calibration.tag_child import COUNT, HEADER, TAG_VALUES
 from calibration.tag_edges import refine_corners
 from calibration.tag_pattern import refine_by_pattern
 from recordings.errors import BadInput, TosslabError
+from recordings.limits import open_npz
 from recordings.progress import Progress, Silent
 from recordings.records import TagSighting
 
@@ -188,7 +188,7 @@ def _write(path: Path, lists: Sequence[Sequence[TagDetection]]) -> None:
 def _read(path: Path, images: int) -> list[list[TagDetection]] | None:
     """None where nothing is kept, or what is kept cannot be read (it is then made anew)."""
     try:
-        with np.load(path, allow_pickle=False) as kept:
+        with open_npz(path) as kept:
             data = {name: kept[name] for name in kept.files}
         lists: list[list[TagDetection]] = [[] for _ in range(images)]
         for k, image in enumerate(data["image"].tolist()):
@@ -197,7 +197,7 @@ def _read(path: Path, images: int) -> list[list[TagDetection]] | None:
             margin = float(data["margin"][k])
             lists[image].append(TagDetection(tag_id, corners, covariance, margin, hamming, bool(refined)))
         return lists
-    except (OSError, ValueError, KeyError, IndexError, EOFError, zipfile.BadZipFile):
+    except (OSError, ValueError, KeyError, IndexError):
         return None
 
 

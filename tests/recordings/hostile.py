@@ -10,7 +10,6 @@ import sqlite3
 import struct
 import zipfile
 import zlib
-from collections.abc import Callable
 from pathlib import Path
 
 import lz4.frame
@@ -98,8 +97,9 @@ def repeating_collada(path: Path) -> None:
     node = '<node><instance_geometry url="#g"/></node>'
     path.write_text(
         '<COLLADA><asset><up_axis>Z_UP</up_axis></asset><geometry id="g"><mesh><source id="s"><float_array>'
-        f'{points}</float_array></source><vertices id="v"><input semantic="POSITION" source="#s"/></vertices><triangles>'
-        f'<input semantic="VERTEX" source="#v" offset="0"/><p>0 1 2</p></triangles></mesh></geometry>{node * 30_000}'
+        f'{points}</float_array></source><vertices id="v"><input semantic="POSITION" source="#s"/></vertices>'
+        '<triangles><input semantic="VERTEX" source="#v" offset="0"/><p>0 1 2</p></triangles></mesh></geometry>'
+        f"{node * 30_000}"
         "</COLLADA>"
     )
 
