@@ -115,9 +115,17 @@ def _submit(work: Callable[..., dict[str, Any]], task: Task, where: Where) -> _R
 
 
 def _marked(work: Callable[..., dict[str, Any]], arguments: tuple[Any, ...], marker: Path) -> None:
-    """In the job's process: the work, then its result as the marker, whole or not there."""
+    """In the job's process: the work, then its result, or what it raised, as the marker, whole or not there."""
+    try:
+        _write_marker(marker, {"result": work(*arguments)})
+    except Exception as wrong:
+        _write_marker(marker, {"raised": f"{type(wrong).__name__}: {wrong}"})
+        raise  # for the log
+
+
+def _write_marker(marker: Path, told: dict[str, Any]) -> None:
     partial = marker.with_suffix(".partial")
-    partial.write_text(json.dumps(work(*arguments)))
+    partial.write_text(json.dumps(told))
     partial.replace(marker)
 
 
@@ -162,13 +170,16 @@ class _Queue:
 
 
 def _result(one: _Running, task: Task) -> dict[str, Any]:
-    """What the job gave, or the last line of why it did not."""
-    if one.marker.exists():
-        result = dict(read_json(one.marker))
-        one.marker.unlink()
-        return result
+    """What the job gave, or what it raised, or its log's last line."""
     last = ""
-    with contextlib.suppress(OSError):
-        last = (one.job.paths.stderr.read_text(errors="replace").strip().splitlines() or [""])[-1]
-    why = f" ({last[:300]})" if last else ""
+    if one.marker.exists():
+        told = read_json(one.marker)
+        one.marker.unlink()
+        if "result" in told:
+            return dict(told["result"])
+        last = str(told["raised"])
+    else:
+        with contextlib.suppress(OSError):
+            last = one.job.paths.stderr.read_text(errors="replace").strip()
+    why = f" ({last.splitlines()[-1][:300]})" if last else ""
     return {"error": f"the process ended without a result{why}; its log is in {task.logs}"}
