@@ -142,7 +142,8 @@ class Slurm:
         self.running["slurmd"].kill()
         self.running["slurmd"].wait()
         steps = [p for p in Path("/proc").glob("[0-9]*") if _runs(p, self.root / "usr" / "sbin" / "slurmstepd-wlm")]
-        for process in [*(c for s in steps for c in _descendants(int(s.name))), *(int(s.name) for s in steps)]:
+        children = [child for step in steps for child in _descendants(int(step.name))]
+        for process in [*(int(step.name) for step in steps), *children]:  # steps first: they would report the end
             with contextlib.suppress(ProcessLookupError):
                 os.kill(process, signal.SIGKILL)
 
