@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 
 
 def coverage_floor(run: Run, record: VariantRecord, truth: Truth) -> tuple[dict[str, Value], tuple[str, ...]]:
-    """`cd_floor`: mean Chamfer distance over the tosses, each toss's frames fused at its true poses; and of which tosses
-    it could not be computed, and why. Uses the truth, so it is called by the scorer only."""
+    """`cd_floor`: mean Chamfer distance over the tosses, each toss's frames fused at its true poses; and of which
+    tosses it could not be computed, and why. Uses the truth, so it is called by the scorer only."""
     mesh = true_mesh(truth)
     if mesh is None:
         return {}, ()

@@ -126,15 +126,14 @@ def _legend(rows: Sequence[dict[str, Any]]) -> list[str]:
     """What the columns mean, as far as they are there."""
     there = {name for row in rows for name in row["values"]}
     lines = [
-        "All frames of these tosses count; a lost one has an infinite error, and a toss that is lost from end to end is "
-        "lost in every frame.",
+        "All frames of these tosses count; a lost one has an infinite error, also in a toss that is lost end to end.",
         "Poses are aligned per toss at its own first frame; a toss whose first frame is lost is not aligned. CD icp: "
         "after a further rigid alignment of the mesh.",
     ]
     if "cd_floor" in there:
         lines.append("floor: each toss's frames fused at the true poses: what one toss can show of the shape at all.")
     if there & {name for name, _ in CONTACT_COLUMNS}:
-        lines.append("Friction, restitution and rollouts with their 95 % intervals; rollouts: mean error over 99 steps.")
+        lines.append("Friction, restitution and rollouts with 95 % intervals; rollouts: mean error over 99 steps.")
     if any(row["paper"] for row in rows):
         lines.append("In brackets: the paper's figure for this row, on the paper's own data.")
     return lines

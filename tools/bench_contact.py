@@ -13,6 +13,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -20,6 +21,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np
 import torch
 
+from processing.contact.data_checks import duplicate_groups
 from processing.contact.evaluate import evaluate
 from processing.contact.from_tracks import learn_from_series
 from processing.contact.inertia import Physics, known_physics, uniform_physics
@@ -45,6 +47,18 @@ def toss(number: int) -> PoseSeries:
 
 def there(numbers: Sequence[int]) -> list[int]:
     return [n for n in numbers if (TOSSES / f"{n}.pt").exists()]
+
+
+@cache
+def repeats() -> frozenset[int]:
+    """Tosses that are the recording of a lower number again."""
+    groups = duplicate_groups([toss(n) for n in there(range(600))])
+    return frozenset(t for group in groups for t in group[1:])
+
+
+def recorded_once(numbers: Sequence[int]) -> list[int]:
+    """Those of the numbers that are there and repeat no recording of a lower number: halves then share none."""
+    return [n for n in there(numbers) if n not in repeats()]
 
 
 def test_tosses() -> list[PoseSeries]:

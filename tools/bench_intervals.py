@@ -16,11 +16,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from bench_contact import CUBE, any_body, held, line, noisy, run_cases, simulated, there, toss
+from bench_contact import CUBE, any_body, held, line, noisy, recorded_once, run_cases, simulated, toss
 
 from processing.contact import friction as slow_friction
 from processing.contact import intervals
-from processing.contact.data_checks import duplicate_groups
 from processing.contact.inertia import uniform_physics
 from processing.contact.learn import ContactConfig, ContactLearning, learn_contact
 from processing.contact.prior import prior_from_size
@@ -35,8 +34,8 @@ BODIES = 32
 
 @dataclass(frozen=True)
 class Reading:
-    """An estimate beside its truth; `sampling` is half its 95 % interval without what the model leaves, `scale` what the
-    model's deviation is relative to."""
+    """An estimate beside its truth; `sampling` is half its 95 % interval without what the model leaves, `scale` what
+    the model's deviation is relative to."""
 
     value: float
     truth: float
@@ -77,11 +76,10 @@ def without(width: float, model: float) -> float:
 
 def one() -> None:
     """Single real tosses: friction, and every edge relative to itself."""
-    tracks = [toss(n) for n in there(range(600))]
-    again = {t for group in duplicate_groups(tracks) for t in group[1:]}
+    tracks = [toss(n) for n in recorded_once(range(600))]
     friction: dict[bool, list[Reading]] = {True: [], False: []}
     edges: dict[bool, list[Reading]] = {True: [], False: []}
-    for track in (t for t in tracks if t.toss not in again):
+    for track in tracks:
         found = learn_contact([track], prior_from_size("box", 0.05), CUBE)
         half, f = track.toss < SPLIT, found.friction
         sampling = without(found.spread.friction, intervals.MODEL_FRICTION)
@@ -89,7 +87,6 @@ def one() -> None:
         for edge, width in zip(found.extents, found.spread.extents_m):
             left = without(float(width), intervals.MODEL_SIZE * edge.value)
             edges[half].append(Reading(edge.value, TRUE_EDGE_M, left, edge.value))
-    line("one toss", f"{len(tracks)} recordings, {len(again)} of them again")
     told("one toss, friction", friction[True], friction[False], intervals.MODEL_FRICTION)
     told("one toss, edges", edges[True], edges[False], intervals.MODEL_SIZE)
 

@@ -178,7 +178,8 @@ def scorer() -> ModuleType:
     if not SCORER.exists():
         pytest.skip(f"the independent scorer is not at {SCORER}: set TOSSLAB_DATA to the shared data")
     spec = importlib.util.spec_from_file_location("independent_scorer", SCORER)
-    assert spec is not None and spec.loader is not None
+    assert spec is not None
+    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
