@@ -244,7 +244,7 @@ def _evaluate(args: argparse.Namespace, session: Session, out: Path, run: Run) -
         if truth is not None:
             scores[variant] = score_variant(results, record, truth)
             if record.scope == "one":
-                scores[variant].values.update(coverage_floor(run, record, truth))
+                scores[variant] = scores[variant].with_more(*coverage_floor(run, record, truth))
             mesh = true_mesh(truth)
     rows = collect(results, scores)
     with locked(out / ".table.lock"):  # of two runs on one folder, each writes a whole table

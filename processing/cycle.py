@@ -16,7 +16,8 @@ from numpy import ndarray as Array
 from scipy.spatial.transform import Rotation
 from scipy.stats import t as student
 
-from processing.dynamics import contact_stage, held_out_losses, held_out_model
+from processing.dynamics import contact_stage
+from processing.held_out import Half, halves_of, held_out_losses, learned_by, why_no_halves
 from processing.icp import ShapeSurface
 from processing.joint_stage import joint_stage
 from processing.judge import CHANCE, Explained, difference, explain, pooled
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
 class Pass:
     """Where a pass ended, per toss: the stages that hold its track, its masks, and the shape in the track's object
     frame. `passes`: what each pass of the cycle changed and how well it explains the raw images.
+    `halves`: the shape so far had contact been learned from one half of the tosses, to judge the other half by.
     `warnings` are what a reader must know before he uses the result, `notes` how it was made."""
 
     tracks: Mapping[int, Done]
@@ -45,6 +47,7 @@ class Pass:
     shared_frame: bool
     contact: Mapping[int, Done] = field(default_factory=dict)
     rollout: Done | None = None
+    halves: tuple[Half, ...] = ()
     warnings: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     passes: tuple[Mapping[str, Any], ...] = ()
@@ -71,8 +74,10 @@ def run_cycle(run: Run, variant: Variant, start: Pass, name: str) -> Pass:
     refined = with_contact(run, start, name) if variant.contact else start
     if variant.refined == "contact":
         return refined
-    ended = second_pass(run, refined, start.masks, name, variant.icp)
-    told = _told(run, start, ended, start.masks, name)
+    start = replace(start, halves=halves_of(start.tracks, start.shapes))
+    ended, losses = judged_pass(run, start, refined, name, variant.icp)
+    told = _told(run, start, ended, start.masks, name, losses)
+    refined, ended = (replace(x, notes=(*x.notes, *why_no_halves(start.tracks, losses[0]))) for x in (refined, ended))
     if told["worse_share"] > run.config.cycle.much_worse:
         worse = f"explains the raw images worse by {100 * told['worse_share']:.1f} %"
         note = f"{name}: the second pass {worse}: kept out, poses and shape are those before it"
@@ -128,13 +133,33 @@ def second_pass(run: Run, refined: Pass, masks: Mapping[int, Done], name: str, i
     return replace(refined, tracks=tracks, shapes=dict.fromkeys(tracks, field_of))
 
 
+def judged_pass(
+    run: Run, before: Pass, refined: Pass, name: str, icp: bool
+) -> tuple[Pass, tuple[dict[int, float], dict[int, float]]]:
+    """The second pass, and the contact losses per toss (J) before and after it, each toss judged by the half that did
+    not learn from it: what contact corrects of the half's shape goes through the second pass as the row's does."""
+    after = second_pass(run, refined, before.masks, name, icp)
+    halves = learned_by(run, before.halves, before.tracks, name)
+    body, seen = next(iter(refined.shapes.values())), next(iter(after.shapes.values()))
+    corrected = body.key != next(iter(before.shapes.values())).key
+    drawn = align_stage(run, name, refined.tracks, body, before.masks, icp)
+    ended = []
+    for half in halves:
+        shape = seen
+        if corrected and half.contact is not None:
+            shape = second_field(run, f"{name}, {half.name}", after.tracks, drawn, half.contact, before.masks)
+        ended.append(replace(half, shape=shape))
+    losses = held_out_losses(run, name, before.tracks, halves), held_out_losses(run, name, after.tracks, ended)
+    return replace(after, halves=tuple(ended)), losses
+
+
 def _until_converged(run: Run, second: Pass, name: str) -> Pass:
     """After the second pass further ones, for as long as they explain the raw images better and change poses or shape;
     the best one is kept."""
     best, passes = second, list(second.passes)
     for number in range(3, 3 + run.config.cycle.most_passes):
-        after = second_pass(run, with_contact(run, best, name), best.masks, name, icp=True)
-        told = {"pass": number, **_told(run, best, after, best.masks, name)}
+        after, losses = judged_pass(run, best, with_contact(run, best, name), name, icp=True)
+        told = {"pass": number, **_told(run, best, after, best.masks, name, losses)}
         passes.append(told)
         worse = 100 * told["worse_share"]
         if worse > 0:
@@ -151,7 +176,8 @@ def _until_converged(run: Run, second: Pass, name: str) -> Pass:
 
 
 def _joint(run: Run, start: Pass, name: str) -> Pass:
-    """One pass of the cycle, then all terms in one objective; friction by contact learning at its poses and shape."""
+    """One pass of the cycle, then all terms in one objective; friction by contact learning at its poses and shape.
+    Contact is among the terms, of all tosses: no toss is left that it could be judged by."""
     begun = second_pass(run, with_contact(run, start, name), start.masks, name, icp=True)
     shape = next(iter(begun.shapes.values()))
     solved = joint_stage(run, begun.tracks, shape, start.masks)
@@ -162,7 +188,7 @@ def _joint(run: Run, start: Pass, name: str) -> Pass:
     warnings += [f"{name}: {solved.counts['kept_out']}"] if "kept_out" in solved.counts else []
     ended = replace(begun, tracks=tracks, shapes=tracks, contact={} if kept_out else dict.fromkeys(tracks, learned),
                     warnings=(*start.warnings, *warnings))  # fmt: skip
-    return replace(ended, passes=(_told(run, begun, ended, start.masks, name),))
+    return replace(ended, passes=(_told(run, begun, ended, start.masks, name, ({}, {})),))
 
 
 def certain_share(before: Mapping[int, float], after: Mapping[int, float]) -> float:
@@ -176,11 +202,13 @@ def certain_share(before: Mapping[int, float], after: Mapping[int, float]) -> fl
     return float(gaps.mean() / first.mean()) if abs(gaps.mean()) > beyond else 0.0
 
 
-def _told(run: Run, before: Pass, after: Pass, masks: Mapping[int, Done], name: str) -> dict[str, Any]:
-    """What changed from one pass to the next, and which of them explains the raw images better."""
+def _told(
+    run: Run, before: Pass, after: Pass, masks: Mapping[int, Done], name: str,
+    contact: tuple[Mapping[int, float], Mapping[int, float]],
+) -> dict[str, Any]:  # fmt: skip
+    """What changed from one pass to the next, and which of them explains the raw images better; and the contact of
+    tosses held out, where `contact` has losses of both passes."""
     was, now = (judge_stage(run, name, x.tracks, x.shapes, masks).counts for x in (before, after))
-    learned = held_out_model(run, name, before.tracks, before.shapes)
-    contact = [held_out_losses(run, name, x.tracks, x.shapes, learned) for x in (before, after)]
     shares = [now[k] / was[k] - 1 for k in ("depth_m", "mask", "color") if was[k] and now[k] is not None]
     if all(contact):
         shares.append(certain_share(*contact))

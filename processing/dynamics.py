@@ -3,22 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
-
-from scipy.optimize import minimize_scalar
 
 from processing.stage import Counts, Done
 from processing.vision import CAMERA
 from recordings.errors import BadInput
-from recordings.geometry import Transform
-from recordings.results import read_contact, read_shape, read_track, write_contact, write_shape
+from recordings.results import read_shape, read_track, write_contact, write_shape
 from recordings.session_writer import write_json
-from recordings.tracks import ContactModel, ObjectShape, ObjectTrack
+from recordings.tracks import ObjectShape
 
 if TYPE_CHECKING:
-    from processing.contact.judge import TossLoss
     from processing.pipeline import Run
 
 
@@ -39,7 +34,7 @@ def contact_stage(run: Run, name: str, tracks: Mapping[int, Done], shape: Done) 
             write_shape(folder, prior)
             return {"kept_out": str(why)}
 
-    return run.store.run("contact", 1, run.config.contact, inputs, compute)
+    return run.store.run("contact", 2, run.config.contact, inputs, compute)
 
 
 def _learn(run: Run, name: str, tracks: Mapping[int, Done], folder: Path, prior: ObjectShape) -> Counts:
@@ -102,78 +97,7 @@ def rollout_stage(run: Run, name: str, tracks: Mapping[int, Done], shape: Done) 
         write_json(folder / "rollout.json", figure.to_json())
         return {"tosses": len(figure.estimated.errors.tosses)}
 
-    return run.store.run("rollout", 1, run.config.contact, inputs, compute)
-
-
-LEAST_HELD_OUT = 4
-"""Tosses from which on half of them are kept for judging: learned from fewer than two, friction is hardly known."""
-
-
-def held_out_model(run: Run, name: str, tracks: Mapping[int, Done], shapes: Mapping[int, Done]) -> Done | None:
-    """Contact learned from every other toss, to judge the rest by; None where tosses are too few, do not share a shape,
-    or show no contact."""
-    if len(tracks) < LEAST_HELD_OUT or len({s.key for s in shapes.values()}) > 1:
-        return None
-    half = {t: tracks[t] for t in sorted(tracks)[::2]}
-    learned = contact_stage(run, f"{name}, every other one", half, next(iter(shapes.values())))
-    return None if learned.counts.get("kept_out") else learned
-
-
-def held_out_losses(
-    run: Run, name: str, tracks: Mapping[int, Done], shapes: Mapping[int, Done], learned: Done | None
-) -> dict[int, float]:
-    """Contact loss (J) of each toss that `held_out_model` left out, of a shape at given poses; empty without a model or
-    where none of them can be used.
-
-    At the height of the plane that suits shape and poses best: size and height are not identifiable together, and a
-    shape that grew would else be charged for a plane that lies too high.
-    """
-    if learned is None:
-        return {}
-    rest = {t: tracks[t] for t in sorted(tracks)[1::2]}
-    done = held_out_stage(run, name, rest, next(iter(shapes.values())), learned)
-    return {int(t): float(x) for t, x in done.counts.get("loss_j", {}).items()}
-
-
-def held_out_stage(run: Run, name: str, tracks: Mapping[int, Done], shape: Done, learned: Done) -> Done:
-    """Stage `held-out`: the contact loss per toss, with friction and inertia learned from others."""
-    inputs = {"shape": shape.key, "learned": learned.key, **{f"track_{t:02d}": d.key for t, d in tracks.items()}}
-    inputs |= {"calibration": run.keys["calibration"]}
-
-    def compute(folder: Path) -> Counts:
-        run.progress(f"{name}: contact loss of tosses not learned from").step(0, 1, "")
-        poses = {t: read_track(d.folder, t) for t, d in tracks.items()}
-        world_from_camera = run.session.calibration.transform("world", CAMERA)
-        try:
-            raised_m, losses = _at_best_height(
-                poses, read_shape(shape.folder), read_contact(learned.folder), world_from_camera
-            )
-        except BadInput as why:
-            return {"kept_out": str(why)}
-        write_json(folder / "losses.json", {str(t): asdict(x) for t, x in losses.items()})
-        return {"loss_j": {str(t): x.loss_j for t, x in losses.items()}, "raised_m": raised_m}
-
-    return run.store.run("held-out", 2, {}, inputs, compute)
-
-
-HEIGHTS_M = (-0.004, 0.004)
-"""How far the plane may lie from where calibration has it."""
-
-
-def _at_best_height(
-    poses: Mapping[int, ObjectTrack], shape: ObjectShape, model: ContactModel, world_from_camera: Transform
-) -> tuple[float, dict[int, TossLoss]]:
-    """How far (m) the plane is raised where the mean loss is least, and the losses there."""
-    from processing.contact.judge import contact_loss_of, mean_loss_j
-    from processing.contact.plane import Plane
-
-    def losses(raised_m: float) -> dict[int, TossLoss]:
-        plane = Plane(model.plane_normal_world, model.plane_offset_m + float(raised_m), "the contact model")
-        return contact_loss_of(poses, shape, model, world_from_camera, plane)
-
-    options = {"xatol": 2e-4}
-    best = minimize_scalar(lambda x: mean_loss_j(losses(x)), bounds=HEIGHTS_M, method="bounded", options=options)
-    return float(best.x), losses(best.x)
+    return run.store.run("rollout", 2, run.config.contact, inputs, compute)
 
 
 NO_PLANE = (

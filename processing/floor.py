@@ -23,30 +23,34 @@ if TYPE_CHECKING:
     from processing.truth import Truth
 
 
-def coverage_floor(run: Run, record: VariantRecord, truth: Truth) -> dict[str, Value]:
-    """`cd_floor`: mean Chamfer distance over the tosses, each toss's frames fused at its true poses. Uses the truth, so
-    it is called by the scorer only."""
+def coverage_floor(run: Run, record: VariantRecord, truth: Truth) -> tuple[dict[str, Value], tuple[str, ...]]:
+    """`cd_floor`: mean Chamfer distance over the tosses, each toss's frames fused at its true poses; and of which
+    tosses it could not be computed, and why. Uses the truth, so it is called by the scorer only."""
     mesh = true_mesh(truth)
     if mesh is None:
-        return {}
-    found = []
+        return {}, ()
+    found, failed = [], []
     for entry in (t for t in record.tosses if t.toss in run.tosses):
-        folder = _fused(run, entry.toss, run.store.results / str(entry.masks), truth)
-        if folder is not None:
-            found.append(chamfers(read_shape(folder), np.eye(4), mesh).fitted.cm)
-    if not found:
-        return {}
-    return {"cd_floor": Value(float(np.mean(found)), "cm", len(found), "each toss fused at its true poses, rigid ICP")}
+        try:
+            folder = _fused(run, entry.toss, run.store.results / str(entry.masks), truth)
+        except BadInput as why:
+            failed.append(f"toss {entry.toss}: what its frames show of the shape (floor) is not known: {why}")
+            continue
+        found.append(chamfers(read_shape(folder), np.eye(4), mesh).fitted.cm)
+    values = {"cd_floor": Value(float(np.mean(found)), "cm", len(found), WHERE)} if found else {}
+    return values, tuple(failed)
 
 
-def _fused(run: Run, toss: int, masks: Path, truth: Truth) -> Path | None:
-    """Stage `floor` of one toss; None where the truth has no poses of it."""
+WHERE = "each toss fused at its true poses, rigid ICP"
 
+
+def _fused(run: Run, toss: int, masks: Path, truth: Truth) -> Path:
+    """Stage `floor` of one toss. Raises BadInput where the truth has no poses of it or no frame shows the object."""
     frames = run.frames(toss)
     track = ObjectTrack.nowhere(toss, run.camera.frame, frames.times_ns)
     poses = truth.camera_from_object(track)
     if poses is None or not np.isfinite(poses).any():
-        return None
+        raise BadInput("the truth has no pose of its frames")
     status: tuple[Status, ...] = tuple("tracked" if np.isfinite(p).all() else "lost" for p in poses)
     known = replace(track, camera_from_object=poses, status=status)
     inputs = {f"toss_{toss:02d}": run.keys[f"toss_{toss:02d}"], "masks": masks.name,
@@ -59,7 +63,4 @@ def _fused(run: Run, toss: int, masks: Path, truth: Truth) -> Path | None:
         write_shape(folder, grid_mesh(fuse(views, run.config.shape.field.fuse)))
         return {"views": len(views), "from": "true poses: for the scores only"}
 
-    try:
-        return run.store.run("floor", 2, run.config.shape.field.fuse, inputs, compute).folder
-    except BadInput:
-        return None
+    return run.store.run("floor", 2, run.config.shape.field.fuse, inputs, compute).folder

@@ -3,7 +3,8 @@
 ADD, ADD-S: area under the recall curve between 0 and 0.1 m, exact, in percent of all frames; a lost frame counts
 as an infinite error. ADD-S runs from each true point to the nearest estimated one. Success: within 5 deg and 5 cm.
 Chamfer: half the sum of the mean distances of 30,000 surface samples of either mesh to the other's surface.
-Alignment of an estimate (whose object frame is arbitrary) happens before, in `align_first` and `icp_align`.
+Alignment of an estimate (whose object frame is arbitrary) happens before, in `align_first` (frame 0; where that is
+lost the estimate is taken as it is) and `icp_align`.
 """
 
 from __future__ import annotations
@@ -58,12 +59,12 @@ FIELDS = ("add_m", "adds_m", "rotation_deg", "translation_m")
 
 
 def align_first(estimate: Float[Array, "n 4 4"], truth: Float[Array, "n 4 4"]) -> Float[Array, "4 4"] | None:
-    """estimated_object_from_true_object that makes the first frame known to both equal; None where there is none."""
-    known = np.isfinite(estimate[:, 0, 0]) & np.isfinite(truth[:, 0, 0])
-    if not known.any():
+    """estimated_object_from_true_object that makes the first frame with a true pose equal; None where the estimate has
+    lost just that frame: no later one may stand in for it, else a late start would be forgiven."""
+    known = np.flatnonzero(np.isfinite(truth).all(axis=(1, 2)))
+    if len(known) == 0 or not np.isfinite(estimate[known[0]]).all():
         return None
-    first = int(np.flatnonzero(known)[0])
-    return np.linalg.inv(estimate[first]) @ truth[first]
+    return np.linalg.inv(estimate[known[0]]) @ truth[known[0]]
 
 
 def frame_errors(

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -38,19 +39,29 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Value:
-    """One number of the table: with its unit, how many it is from, and what was aligned to what."""
+    """One number of the table: with its unit, how many it is from, what was aligned to what, and its 95 % interval
+    where it has one."""
 
     value: float
     unit: str
     n: int
     aligned: str
+    low: float | None = None
+    high: float | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        """As plain values; a number without an interval has no bounds."""
+        return {k: v for k, v in asdict(self).items() if v is not None}
+
+
+AT_FIRST_FRAME = "each toss at its own first frame (not at all where that is lost)"
 
 
 @dataclass(frozen=True, eq=False)
 class TossScore:
-    """Scores of one toss, aligned at its own first frame: `errors`, `phase` and `time_s` (since the first frame) of
-    every frame that has a true pose. `phase` is empty where the world is not known; `shift` is
-    estimated_object_from_true_object."""
+    """Scores of one toss, aligned at its first frame: `errors`, `phase` and `time_s` (since the first frame) of every
+    frame that has a true pose. `phase` is empty where the world is not known; `shift` is
+    estimated_object_from_true_object, None where the first frame is lost: the poses are then scored as they are."""
 
     toss: int
     errors: FrameErrors
@@ -73,44 +84,58 @@ class VariantScore:
     rollout: dict[str, Any] | None = None
     """Rollouts against the truth, as JSON."""
 
+    def with_more(self, values: Mapping[str, Value], warnings: tuple[str, ...]) -> VariantScore:
+        """The same with further values and warnings."""
+        return replace(self, values={**self.values, **values}, warnings=(*self.warnings, *warnings))
+
 
 def score_variant(results: Results, record: VariantRecord, truth: Truth) -> VariantScore:
-    """All scores of one variant that the truth allows."""
+    """All scores of one variant that the truth allows. Every frame with a true pose counts, those of tosses that are
+    lost from end to end too."""
     mesh = true_mesh(truth)
     if mesh is None:
         return VariantScore({}, (), (f"{truth.folder} has no mesh.obj: ADD and Chamfer cannot be scored",))
-    points = surface_points(mesh, POINTS)
     tracks = results.tracks(record.name, record.scope)
-    tosses, shifts, warnings = [], {}, []
+    tosses, warnings = toss_scores(record, tracks, truth, mesh)
+    if not tosses:
+        return VariantScore({}, (), tuple(warnings))
+    values = pose_values(FrameErrors.pooled([t.errors for t in tosses]), AT_FIRST_FRAME)
+    frames, lost = sum(len(t.lost) for t in tracks.values()), sum(int(t.lost.sum()) for t in tracks.values())
+    values["lost_frames"] = Value(float(lost), "frames", frames, "nothing")
+    if record.shared_object_frame:
+        values |= _with_one_alignment(tracks, truth, surface_points(mesh, POINTS), tosses[0].shift)
+    of_shape, placed = shape_values(results, record, {t.toss: t.shift for t in tosses}, mesh)
+    values |= {**of_shape, **friction_error(results, record, truth)}
+    rollout = rollout_scores(results, record, truth, tracks)
+    if rollout is not None:
+        values |= rollout_values(rollout, "rollout", "truth, met at the release")
+    return VariantScore(values, tuple(tosses), tuple(warnings), phase_values(tosses), placed, rollout)
+
+
+def toss_scores(
+    record: VariantRecord, tracks: Mapping[int, ObjectTrack], truth: Truth, mesh: trimesh.Trimesh
+) -> tuple[list[TossScore], list[str]]:
+    """The errors of every toss that has true poses, and what a reader must know of them."""
+    points, tosses, warnings = surface_points(mesh, POINTS), [], []
     for toss, track in tracks.items():
         true = truth.camera_from_object(track)
-        shift = None if true is None else align_first(track.camera_from_object, true)
-        if true is None or shift is None:
-            warnings.append(f"toss {toss}: no frame has both a true and an estimated pose; not scored")
+        if true is None or not np.isfinite(true[:, 0, 0]).any():
+            warnings.append(f"toss {toss}: the truth has no pose of its frames; not scored")
             continue
-        shifts[toss] = shift
-        errors = frame_errors(track.camera_from_object @ shift, true, points)
+        shift = align_first(track.camera_from_object, true)
+        if shift is None and not track.lost.all():
+            warnings.append(f"toss {toss}: its first frame is lost, so its poses are scored without being aligned")
+        errors = frame_errors(_aligned(track, shift), true, points)
         known = np.isfinite(true[:, 0, 0])
         phase = tuple(p for p, k in zip(_phases(record, track, true, mesh), known) if k)
         time_s = 1e-9 * (track.time_ns[known] - track.time_ns[0])
         tosses.append(TossScore(toss, errors, int(track.lost.sum()), time_s, phase, shift))
-    if not tosses:
-        return VariantScore({}, (), tuple(warnings))
-    values = pose_values(FrameErrors.pooled([t.errors for t in tosses]), "each toss at its own first frame")
-    frames = sum(len(t.lost) for t in tracks.values())
-    values["lost_frames"] = Value(float(sum(t.lost for t in tosses)), "frames", frames, "nothing")
-    if record.shared_object_frame:
-        values |= _with_one_alignment(tracks, truth, points, shifts[min(shifts)])
-    of_shape, placed = shape_values(results, record, shifts, mesh)
-    values |= {**of_shape, **contact_values(results, record, truth)}
-    rollout = rollout_scores(results, record, truth, tracks)
-    if rollout is not None:
-        n = len(rollout["tosses"])
-        values["rollout_position"] = Value(1e3 * rollout["position_m"]["mean"], "mm", n, "truth at release")
-        values["rollout_rotation"] = Value(
-            float(np.degrees(rollout["rotation_rad"]["mean"])), "deg", n, "truth at release"
-        )
-    return VariantScore(values, tuple(tosses), tuple(warnings), phase_values(tosses), placed, rollout)
+    return tosses, warnings
+
+
+def _aligned(track: ObjectTrack, shift: Float[Array, "4 4"] | None) -> Float[Array, "n 4 4"]:
+    """camera_from_true_object; without a shift the poses as they are, as the independent scorer has it."""
+    return track.camera_from_object if shift is None else track.camera_from_object @ shift
 
 
 def _phases(
@@ -129,8 +154,7 @@ def phase_values(tosses: list[TossScore]) -> dict[str, dict[str, Value]]:
         return {}
     every = FrameErrors.pooled([t.errors for t in tosses])
     labels = np.array([p for t in tosses for p in (t.phase or ["held"] * len(t.errors.add_m))])
-    aligned = "each toss at its own first frame"
-    return {p: pose_values(every.only(labels == p), aligned) for p in PHASES if (labels == p).any()}
+    return {p: pose_values(every.only(labels == p), AT_FIRST_FRAME) for p in PHASES if (labels == p).any()}
 
 
 def rollout_scores(
@@ -168,16 +192,23 @@ def rollout_scores(
     }  # fmt: skip
 
 
-def contact_values(results: Results, record: VariantRecord, truth: Truth) -> dict[str, Value]:
-    """Friction, and its error where the truth knows it."""
+def rollout_values(document: Mapping[str, Any], prefix: str, against: str) -> dict[str, Value]:
+    """Mean errors of rollouts over steps and tosses, with the 95 % interval over tosses: `<prefix>_position` (mm) and
+    `<prefix>_rotation` (deg). A single toss has no interval."""
+    n, found = len(document["tosses"]), {}
+    for name, unit, scale in (("position", "mm", 1e3), ("rotation", "deg", float(np.degrees(1.0)))):
+        summary = document["position_m" if name == "position" else "rotation_rad"]
+        low, high = (max(scale * summary["low"], 0.0), scale * summary["high"]) if n > 1 else (None, None)
+        found[f"{prefix}_{name}"] = Value(scale * summary["mean"], unit, n, against, low, high)
+    return found
+
+
+def friction_error(results: Results, record: VariantRecord, truth: Truth) -> dict[str, Value]:
+    """Learned friction less the true one, where the truth knows it."""
     model = results.contact(record.name, record.scope)
-    if model is None:
+    if model is None or truth.friction is None:
         return {}
-    n = len(record.tosses)
-    values = {"friction": Value(model.friction, "", n, "nothing")}
-    if truth.friction is not None:
-        values["friction_error"] = Value(model.friction - truth.friction, "", n, "nothing")
-    return values
+    return {"friction_error": Value(model.friction - truth.friction, "", len(record.tosses), "nothing")}
 
 
 def pose_values(e: FrameErrors, aligned: str, prefix: str = "") -> dict[str, Value]:
@@ -188,9 +219,9 @@ def pose_values(e: FrameErrors, aligned: str, prefix: str = "") -> dict[str, Val
         "add_auc": (auc_percent(e.add_m), "%"),
         "success_5deg_5cm": (100 * float(e.success.mean()), "%"),
         "success_5deg_2cm": (100 * float(e.within(5.0, 0.02).mean()), "%"),
-        "median_rotation": (_quantile(e.rotation_deg, 0.5), "deg"),
+        "median_rotation": (float(np.median(e.rotation_deg)), "deg"),
         "p90_rotation": (_quantile(e.rotation_deg, 0.9), "deg"),
-        "median_translation": (1000 * _quantile(e.translation_m, 0.5), "mm"),
+        "median_translation": (1000 * float(np.median(e.translation_m)), "mm"),
         "p90_translation": (1000 * _quantile(e.translation_m, 0.9), "mm"),
         "flipped_frames": (float((np.isfinite(e.rotation_deg) & (e.rotation_deg > FLIPPED_DEG)).sum()), "frames"),
     }
@@ -203,28 +234,34 @@ def _quantile(values: Float[Array, " n"], share: float) -> float:
 
 
 def _with_one_alignment(
-    tracks: dict[int, ObjectTrack], truth: Truth, points_m: Float[Array, "p 3"], shift: Float[Array, "4 4"]
+    tracks: Mapping[int, ObjectTrack], truth: Truth, points_m: Float[Array, "p 3"], shift: Float[Array, "4 4"] | None
 ) -> dict[str, Value]:
     parts = []
     for track in tracks.values():
         true = truth.camera_from_object(track)
         if true is not None:
-            parts.append(frame_errors(track.camera_from_object @ shift, true, points_m))
-    return pose_values(FrameErrors.pooled(parts), "all tosses at the first toss's first frame", "global_")
+            parts.append(frame_errors(_aligned(track, shift), true, points_m))
+    where = "all tosses at the first toss's first frame (not at all where that is lost)"
+    return pose_values(FrameErrors.pooled(parts), where, "global_")
 
 
 def shape_values(
-    results: Results, record: VariantRecord, shifts: dict[int, Float[Array, "4 4"]], truth: trimesh.Trimesh
+    results: Results, record: VariantRecord, shifts: Mapping[int, Float[Array, "4 4"] | None], truth: trimesh.Trimesh
 ) -> tuple[dict[str, Value], Float[Array, "4 4"] | None]:
     """Chamfer distances: of the variant's one shape, or the mean over the tosses' own (scope one). Also where the
     variant's one shape lies after the alignment by ICP."""
     if record.scope == "all":
         first = _first_in_frame_of(results, record, shifts)
-        pairs = [(results.shape(record.name, "all"), shifts[first])] if first is not None else []
-        where = f"first frame of toss {first}"
+        placing = np.eye(4) if first is None else shifts[first]
+        pairs = [(results.shape(record.name, "all"), placing)]
+        where = "not aligned: no first frame is known" if first is None else f"first frame of toss {first}"
     else:
-        pairs = [(results.shape(record.name, "one", t), shift) for t, shift in shifts.items()]
-        where = "each toss's first frame, mean over tosses"
+        pairs = [
+            (results.shape(record.name, "one", t), np.eye(4) if shift is None else shift)
+            for t, shift in shifts.items()
+            if t in _with_own_shape(results, record)
+        ]
+        where = "each toss's first frame (not at all where that is lost), mean over tosses with a shape"
     scored = [chamfers(shape, shift, truth) for shape, shift in pairs if len(shape.faces)]
     if not scored:
         return {}, None
@@ -244,11 +281,18 @@ def shape_values(
     return values, scored[0].true_from_shape if record.scope == "all" else None
 
 
-def _first_in_frame_of(results: Results, record: VariantRecord, shifts: dict[int, Float[Array, "4 4"]]) -> int | None:
-    """The first scored toss whose track is in the shape's object frame."""
+def _first_in_frame_of(
+    results: Results, record: VariantRecord, shifts: Mapping[int, Float[Array, "4 4"] | None]
+) -> int | None:
+    """The first toss that is aligned and whose track is in the shape's object frame."""
     frame = results.shape(record.name, record.scope).object_frame
     tracks = results.tracks(record.name, record.scope)
-    return next((t for t in sorted(shifts) if tracks[t].object_frame == frame), None)
+    return next((t for t in sorted(shifts) if shifts[t] is not None and tracks[t].object_frame == frame), None)
+
+
+def _with_own_shape(results: Results, record: VariantRecord) -> list[int]:
+    """Tosses with a shape of their own: one that is lost from end to end has another's in its place."""
+    return [t for t, track in results.tracks(record.name, record.scope).items() if not track.lost.all()]
 
 
 @dataclass(frozen=True, eq=False)

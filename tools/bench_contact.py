@@ -1,6 +1,7 @@
-"""Contact learning against the figures of its issue: accuracy, CPU seconds, intervals, other shapes.
+"""Contact learning against the figures of its issue: accuracy, CPU seconds, other shapes. Its intervals: see
+bench_intervals.py.
 
-python tools/bench_contact.py [CASE...]      # box16 box64 hull16 noise one shapes variety; all by default
+python tools/bench_contact.py [CASE...]      # box16 box64 hull16 noise shapes; all by default
 
 Needs the real cube tosses: TOSSLAB_DATA/contactnets/tosses_processed. One thread; CPU seconds, not wall time.
 """
@@ -12,6 +13,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -19,14 +21,14 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np
 import torch
 
+from processing.contact.data_checks import duplicate_groups
 from processing.contact.evaluate import evaluate
 from processing.contact.from_tracks import learn_from_series
 from processing.contact.inertia import Physics, known_physics, uniform_physics
-from processing.contact.learn import ContactConfig, ContactLearning, learn_contact
+from processing.contact.learn import ContactLearning, learn_contact
 from processing.contact.motion import PoseSeries, rotation_matrices
 from processing.contact.plane import Plane
 from processing.contact.prior import Prior, prior_from_shape, prior_from_size
-from recordings.errors import BadInput
 from recordings.tracks import ObjectShape
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -45,6 +47,18 @@ def toss(number: int) -> PoseSeries:
 
 def there(numbers: Sequence[int]) -> list[int]:
     return [n for n in numbers if (TOSSES / f"{n}.pt").exists()]
+
+
+@cache
+def repeats() -> frozenset[int]:
+    """Tosses that are the recording of a lower number again."""
+    groups = duplicate_groups([toss(n) for n in there(range(600))])
+    return frozenset(t for group in groups for t in group[1:])
+
+
+def recorded_once(numbers: Sequence[int]) -> list[int]:
+    """Those of the numbers that are there and repeat no recording of a lower number: halves then share none."""
+    return [n for n in there(numbers) if n not in repeats()]
 
 
 def test_tosses() -> list[PoseSeries]:
@@ -158,29 +172,6 @@ def noise() -> None:
             )
 
 
-def one() -> None:
-    """50 single tosses: how often the intervals hold friction .18 and the size that the data have (102.4 mm)."""
-    friction, size, each, widths = [], [], [], []
-    picked = there(range(160, 400))[:50]
-    for n in picked:
-        learning = learn_contact([toss(n)], prior_from_size("box", 0.05), CUBE)
-        f = learning.friction
-        friction.append(f.low <= 0.18 <= f.high)
-        inside = [e.low <= 0.1024 <= e.high for e in learning.extents]
-        each += inside
-        size.append(all(inside))
-        widths.append([f.value, f.high - f.value, *((e.high - e.low) / 2e-3 for e in learning.extents)])
-    w = np.array(widths)
-    line(
-        "one toss",
-        f"{len(picked)} tosses: friction inside {100 * np.mean(friction):.0f} %, all edges inside "
-        f"{100 * np.mean(size):.0f} %, "
-        f"each edge {100 * np.mean(each):.0f} %; median half widths {np.median(w[:, 1]):.3f}, "
-        f"{np.median(w[:, 2:]):.2f} mm; "
-        f"friction {np.mean(w[:, 0]):.3f} +- {np.std(w[:, 0]):.3f}",
-    )
-
-
 def simulated(
     mesh_pieces: Sequence[object],
     physics: Physics,
@@ -226,44 +217,6 @@ def simulated(
         table = np.array(rows)
         tracks.append(PoseSeries.from_quaternions(n, STEP_S, table[:, 3:], table[:, :3]))
     return tracks
-
-
-def variety(count: int = 24) -> None:
-    """Friction at 30 Hz of simulated bodies of any kind: shape, friction .1 to .5, rebound, stiffness, noise. The mean
-    and the standard deviation of estimate / truth are where friction.py's MODEL_SHARE is from."""
-    rows = []
-    for seed in range(count):
-        rng = np.random.default_rng([77, seed])
-        kind, mu = ("box", "box", "prism", "L-shape")[seed % 4], float(rng.uniform(0.1, 0.5))
-        damping, soft_s = (1.0, 1.0, 0.5, 0.25)[rng.integers(4)], float(np.exp(rng.uniform(*np.log([0.0015, 0.006]))))
-        mm_noise = (0.5, 1.0, 3.0)[rng.integers(3)]
-        pieces, truth = any_body(kind, rng)
-        shape = ObjectShape("object", "truth", np.asarray(truth.vertices), np.asarray(truth.faces, dtype=np.int64))
-        physics = uniform_physics(shape, 0.37)
-        made = simulated(pieces, physics, mu, 10, seed, soft_s, damping)
-        tracks = [noisy(t, 5, 1e-3 * mm_noise, np.radians(0.5 * mm_noise), seed) for t in made]
-        prior = prior_from_size("box", 0.05) if kind == "box" else held(shape, physics, rng)
-        config = ContactConfig(bootstrap_repeats=2, penetration=1.0 if kind == "box" else 20.0)
-        began = time.process_time()
-        try:
-            f = learn_contact(tracks, prior, physics, config=config).friction
-        except BadInput as wrong:
-            line(f"variety {seed}", f"{kind}, friction {mu:.3f}, rebound damping {damping:g}: refused: {wrong}")
-            continue
-        rows.append([f.value / mu, f.low <= mu <= f.high, damping < 1])
-        line(
-            f"variety {seed}",
-            f"{kind}, rebound damping {damping:g}, {1e3 * soft_s:.1f} ms, noise {mm_noise:g} mm: friction "
-            f"{f.value:.3f} ({f.low:.3f} .. {f.high:.3f}), true {mu:.3f}; {time.process_time() - began:.1f} CPU-s",
-        )
-    ratio, inside, rebounds = np.array(rows).T
-    for name, kept in (("all", ratio > 0), ("with rebound", rebounds > 0), ("without", rebounds == 0)):
-        line(
-            "variety",
-            f"{name}: {int(kept.sum())} bodies, estimate / truth {ratio[kept].mean():.2f} +- {ratio[kept].std():.2f}, "
-            f"rms off {np.sqrt(((ratio[kept] - 1) ** 2).mean()):.2f}, inside the interval "
-            f"{100 * inside[kept].mean():.0f} %",
-        )
 
 
 def any_body(kind: str, rng: np.random.Generator) -> tuple[list[object], object]:
@@ -359,9 +312,7 @@ CASES: dict[str, Callable[[], None]] = {
     "box64": lambda: box(64),
     "hull16": hull,
     "noise": noise,
-    "one": one,
     "shapes": shapes,
-    "variety": variety,
 }
 
 
@@ -381,4 +332,4 @@ def run_cases(cases: dict[str, Callable[[], None]], without_data: Sequence[str] 
 
 
 if __name__ == "__main__":
-    sys.exit(run_cases(CASES, without_data=("shapes", "variety")))
+    sys.exit(run_cases(CASES, without_data=("shapes",)))

@@ -11,7 +11,7 @@ import sys
 from collections.abc import Sequence
 
 import numpy as np
-from bench_contact import CUBE, block, l_mesh, line, noisy, prism, run_cases, simulated, there, toss
+from bench_contact import CUBE, block, l_mesh, line, noisy, prism, recorded_once, run_cases, simulated, there, toss
 
 from processing.contact import data_checks as checks
 from processing.contact.geometry import CORNERS
@@ -29,10 +29,10 @@ SHIFTS_M = (-0.012, -0.008, -0.006, 0.0, 0.006, 0.008, 0.012)
 
 def touched() -> None:
     """How far the plane seems to be off where tosses are moved up by SHIFTS_M, and what is said of it: by touches of
-    real tosses (0-199 chose the limits, 200-399 did not) and of simulated bodies (seed 11 chose, 29 did not), by
-    forecasts at 30 Hz: `forecast`."""
+    real tosses (0-199 chose the limits, 200-399 did not; no recording is in both) and of simulated bodies (seed 11
+    chose, 29 did not), by forecasts at 30 Hz: `forecast`."""
     for start in (0, 200):
-        groups = [there(range(i, i + 16)) for i in range(start, start + 200, 16)]
+        groups = [recorded_once(range(i, i + 16)) for i in range(start, start + 200, 16)]
         _said(f"real {start}-{start + 199}", [[toss(n) for n in g] for g in groups if len(g) >= 8])
     for seed, settings in (
         (11, ((0.002, 1.0, 0.25), (0.006, 1.0, 0.15), (0.002, 0.3, 0.4))),

@@ -23,6 +23,7 @@ from processing.contact.learn import (
     ContactConfig,
     ContactLearning,
     learn_contact,
+    restitution_of,
     results_of,
     slow_friction,
     with_friction,
@@ -257,6 +258,7 @@ def _fused(
         fitted=model,
         solver_failures=learning.solver_failures + found.last_failures,
         law=None if slow is None else slow.law,
+        restitution=restitution_of(slow),
     )
 
 

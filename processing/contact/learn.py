@@ -94,6 +94,8 @@ class ContactLearning:
     seconds: float
     law: Law | None = None
     """Friction and restitution where they were found by forecasts: rollouts then obey them. None: inelastic."""
+    restitution: Interval | None = None
+    """The law's, with its interval; it cannot be below 0 or above 1."""
 
     @property
     def untouched_vertices(self) -> tuple[int, ...]:
@@ -181,6 +183,7 @@ def learn_contact(
         cpu_seconds=cpu_seconds,
         seconds=time.perf_counter() - began,
         law=None if slow is None else slow.law,
+        restitution=restitution_of(slow),
     )
 
 
@@ -257,6 +260,14 @@ def slow_friction(
         return None
     rigid, tracks = _as_rigid(fitted, optimum, prepared)
     return friction_by_forecasts(rigid, tracks, prepared.smoothed, config.seed)
+
+
+def restitution_of(slow: ForecastFriction | None) -> Interval | None:
+    """The restitution with its interval, where friction was found by forecasts."""
+    if slow is None:
+        return None
+    value, half = slow.law.restitution, slow.restitution_half_width
+    return Interval(value, max(value - half, 0.0), min(value + half, 1.0))
 
 
 def _as_rigid(fitted: Model, optimum: Float[Array, " p"], prepared: Prepared) -> tuple[RigidBody, list[PoseSeries]]:

@@ -25,7 +25,7 @@ def result_document(learning: ContactLearning, evaluation: Evaluation | None) ->
     document: dict[str, Any] = {
         "geometry": learning.geometry,
         "friction": learning.friction.to_json(),
-        "restitution": None if learning.law is None else learning.law.restitution,
+        "restitution": None if learning.restitution is None else learning.restitution.to_json(),
         "extents_m": [s.to_json() for s in sizes],
         "intervals_by": learning.spread.method,
         "ground_plane_sensitivity": dict(learning.plane_sensitivity),

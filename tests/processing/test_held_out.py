@@ -1,7 +1,8 @@
-"""Passes are also compared by the contact loss of tosses that nothing of contact was learned from."""
+"""Passes are also compared by contact, each toss by what the other half of the tosses taught."""
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,13 +11,16 @@ import pytest
 import trimesh
 
 from processing.config import Config
-from processing.cycle import certain_share
-from processing.dynamics import held_out_losses, held_out_model
+from processing.cycle import Pass, certain_share, judged_pass, with_contact
+from processing.field.learn import LearnConfig
+from processing.field.train import FieldConfig
+from processing.held_out import Half, halves_of, held_out_losses, learned_by, why_no_halves
+from processing.masks import object_masks, static_scene
 from processing.pipeline import Run, start_run
 from processing.stage import Done
 from processing.truth import open_truth
 from recordings.progress import Silent
-from recordings.results import read_shape, write_shape, write_track
+from recordings.results import read_shape, read_track, write_shape, write_track
 from recordings.session import Session
 from recordings.tracks import ObjectShape, ObjectTrack, Status
 
@@ -27,7 +31,8 @@ SAMPLE = Path(__file__).resolve().parents[2] / "recordings" / "samples" / "box_t
 def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
     session = Session.open(SAMPLE)
     place = tmp_path_factory.mktemp("held-out")
-    return start_run(session, session.tosses, place, Config(), "multi-hypothesis", lambda _: Silent())
+    config = Config(shape=LearnConfig(most_views=12, field=FieldConfig(steps=4)))
+    return start_run(session, session.tosses, place, config, "multi-hypothesis", lambda _: Silent())
 
 
 @pytest.fixture(scope="module")
@@ -69,32 +74,88 @@ def stored_shape(run: Run, shape: ObjectShape) -> Done:
     return run.store.run("shape", 1, {}, {"size": str(float(np.ptp(shape.vertices_m)))}, write)
 
 
-def test_a_shape_stretched_along_one_axis_has_the_larger_loss_on_tosses_it_was_not_learned_from(
-    run: Run, true_tracks: dict[int, Done], true_shape: Done
+@pytest.fixture(scope="module")
+def halves(run: Run, true_tracks: dict[int, Done], true_shape: Done) -> tuple[Half, ...]:
+    return learned_by(run, halves_of(true_tracks, dict.fromkeys(true_tracks, true_shape)), true_tracks, "test")
+
+
+def losses_of_shape(run: Run, tracks: dict[int, Done], halves: tuple[Half, ...], shape: Done) -> dict[int, float]:
+    return held_out_losses(run, "test", tracks, [replace(h, shape=shape) for h in halves])
+
+
+def test_a_shape_stretched_along_one_axis_has_the_larger_loss_on_every_toss_held_out_both_ways(
+    run: Run, true_tracks: dict[int, Done], true_shape: Done, halves: tuple[Half, ...]
 ) -> None:
     body = read_shape(true_shape.folder)
     stretched = stored_shape(run, replace(body, vertices_m=body.vertices_m * np.array([1.2, 1.0, 1.0])))
-    learned = held_out_model(run, "test", true_tracks, dict.fromkeys(true_tracks, true_shape))
-    assert learned is not None
-    small, large = (
-        held_out_losses(run, "test", true_tracks, dict.fromkeys(true_tracks, s), learned)
-        for s in (true_shape, stretched)
-    )
-    assert list(small) == list(large) == list(true_tracks)[1::2]
+    small, large = (losses_of_shape(run, true_tracks, halves, s) for s in (true_shape, stretched))
+    assert list(small) == list(large) == list(true_tracks)
     assert sum(large.values()) > 1.3 * sum(small.values())
 
 
 def test_a_shape_one_millimetre_larger_all_round_is_no_evidence_because_the_plane_may_lie_lower(
-    run: Run, true_tracks: dict[int, Done], true_shape: Done
+    run: Run, true_tracks: dict[int, Done], true_shape: Done, halves: tuple[Half, ...]
 ) -> None:
     body = read_shape(true_shape.folder)
     outward = np.sign(body.vertices_m - body.vertices_m.mean(0))
     larger = stored_shape(run, replace(body, vertices_m=body.vertices_m + 0.001 * outward))
-    learned = held_out_model(run, "test", true_tracks, dict.fromkeys(true_tracks, true_shape))
-    before, after = (
-        held_out_losses(run, "test", true_tracks, dict.fromkeys(true_tracks, s), learned) for s in (true_shape, larger)
-    )
+    before, after = (losses_of_shape(run, true_tracks, halves, s) for s in (true_shape, larger))
     assert sum(after.values()) < 1.2 * sum(before.values())
+
+
+def test_what_judges_a_toss_is_the_same_whatever_that_toss_did(
+    run: Run, true_tracks: dict[int, Done], true_shape: Done, halves: tuple[Half, ...]
+) -> None:
+    judged = halves[0].judged
+    moved = {t: lifted(run, t, d) if t in judged else d for t, d in true_tracks.items()}
+    again = learned_by(run, halves_of(moved, dict.fromkeys(moved, true_shape)), moved, "test")
+    before, after = ([None if h.contact is None else h.contact.key for h in found] for found in (halves, again))
+    assert after[0] == before[0] is not None
+    assert after[1] != before[1]
+
+
+def lifted(run: Run, toss: int, done: Done) -> Done:
+    """The same toss, 2 mm nearer to the camera."""
+    track = read_track(done.folder, toss)
+    poses = track.camera_from_object.copy()
+    poses[:, 2, 3] -= 0.002
+    return stored_track(run, replace(track, camera_from_object=poses))
+
+
+@pytest.mark.slow
+def test_no_contact_of_a_toss_is_in_the_second_pass_shape_that_it_is_judged_by(
+    run: Run, true_tracks: dict[int, Done], true_shape: Done
+) -> None:
+    """Walks back through the stages that the judging shapes were made from."""
+    scene = static_scene(run)
+    masks = {t: object_masks(run, t, scene) for t in run.tosses}
+    shapes = dict.fromkeys(true_tracks, true_shape)
+    start = Pass(true_tracks, shapes, masks, shared_frame=True, halves=halves_of(true_tracks, shapes))
+    refined = with_contact(run, start, "test")
+    assert refined.shapes[0].key != true_shape.key, "contact's shape must take part, or nothing is shown"
+    after, losses = judged_pass(run, start, refined, "test", icp=False)
+    assert [sorted(x) for x in losses] == [list(run.tosses)] * 2
+    for half in after.halves:
+        assert half.shape.key != after.shapes[0].key
+        assert half.contact is not None
+        behind = tosses_of_contact_behind(run, half.shape) | tosses_of_contact_behind(run, half.contact)
+        assert behind == set(half.learned_from)
+    assert tosses_of_contact_behind(run, after.shapes[0]) == set(run.tosses)
+
+
+def tosses_of_contact_behind(run: Run, done: Done) -> set[int]:
+    """Tosses that any stage `contact` learned from, among those that led to a stage's shape; not what led to poses."""
+    stages = {d["key"]: d for p in run.store.results.glob("*/stage.json") if (d := json.loads(p.read_text()))}
+    found: set[int] = set()
+    todo = [done.key]
+    while todo:
+        stage = stages.get(todo.pop())
+        if stage is None:
+            continue
+        if stage["stage"] == "contact":
+            found |= {int(n.removeprefix("track_")) for n in stage["inputs"] if n.startswith("track_")}
+        todo.append(stage["inputs"].get("shape", ""))
+    return found
 
 
 def test_a_difference_between_few_tosses_counts_only_beyond_chance() -> None:
@@ -105,10 +166,11 @@ def test_a_difference_between_few_tosses_counts_only_beyond_chance() -> None:
     assert certain_share({1: 1.0}, {1: 2.0}) == 0.0
 
 
-def test_three_tosses_are_too_few_to_keep_some_for_judging(
-    run: Run, true_tracks: dict[int, Done], true_shape: Done
+def test_three_tosses_are_too_few_for_halves_and_a_session_says_so(
+    true_tracks: dict[int, Done], true_shape: Done
 ) -> None:
     few = dict(list(true_tracks.items())[:3])
-    shapes = dict.fromkeys(few, true_shape)
-    assert held_out_model(run, "test", few, shapes) is None
-    assert held_out_losses(run, "test", few, shapes, None) == {}
+    assert halves_of(few, dict.fromkeys(few, true_shape)) == ()
+    assert "fewer than 4 tosses" in why_no_halves(few, {})[0]
+    assert why_no_halves(true_tracks, dict.fromkeys(true_tracks, 1.0)) == ()
+    assert "cannot be learned from each half" in why_no_halves(true_tracks, {})[0]

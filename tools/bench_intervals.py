@@ -1,0 +1,148 @@
+"""The intervals of contact learning: what the model leaves is fitted on one half of the bodies or tosses, and how often
+the intervals hold the truth is counted on the other half.
+
+python tools/bench_intervals.py [one] [fast] [slow]      # all by default
+
+`one`: single real tosses (TOSSLAB_DATA/contactnets/tosses_processed), each recording once; numbers below 200 fit, the
+others judge. `fast` (148 Hz, bootstrap) and `slow` (30 Hz, forecasts): simulated bodies of any kind; every second four
+of them fit. One thread; `one` takes 200 CPU seconds, the others up to half a minute a body.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from bench_contact import CUBE, any_body, held, line, noisy, recorded_once, run_cases, simulated, toss
+
+from processing.contact import friction as slow_friction
+from processing.contact import intervals
+from processing.contact.inertia import uniform_physics
+from processing.contact.learn import ContactConfig, ContactLearning, learn_contact
+from processing.contact.prior import prior_from_size
+from recordings.errors import BadInput
+from recordings.tracks import ObjectShape
+
+TRUE_FRICTION, TRUE_EDGE_M = 0.18, 0.1024
+"""Of the real cubes: experiment.json's, and the size that poses above a plane 1.2 mm too high have."""
+SPLIT = 200
+BODIES = 32
+
+
+@dataclass(frozen=True)
+class Reading:
+    """An estimate beside its truth; `sampling` is half its 95 % interval without what the model leaves, `scale` what
+    the model's deviation is relative to."""
+
+    value: float
+    truth: float
+    sampling: float
+    scale: float = 1.0
+
+    @property
+    def wanted(self) -> float:
+        """The model's standard deviation from which on the interval holds the truth."""
+        beyond = max((self.value - self.truth) ** 2 - self.sampling**2, 0.0) ** 0.5
+        return beyond / 1.96 / self.scale
+
+    def holds(self, model: float) -> bool:
+        return abs(self.value - self.truth) <= float(np.hypot(self.sampling, 1.96 * model * self.scale))
+
+
+def told(name: str, fitting: Sequence[Reading], judging: Sequence[Reading], shipped: float) -> None:
+    """The 95 % quantile of what the fitting half wants, and the share of either half that is inside."""
+    fitted = float(np.quantile([r.wanted for r in fitting], 0.95, method="higher"))
+
+    def inside(readings: Sequence[Reading], model: float) -> str:
+        return f"{100 * np.mean([r.holds(model) for r in readings]):.0f} % of {len(readings)}"
+
+    width = float(np.median([np.hypot(r.sampling, 1.96 * shipped * r.scale) for r in judging]))
+    line(
+        name,
+        f"fitted {fitted:.3f}: inside {inside(fitting, fitted)}; on the other half {inside(judging, fitted)}; shipped "
+        f"{shipped:g}: {inside(fitting, shipped)} and {inside(judging, shipped)}, median half width {width:.3f}; "
+        f"estimate - truth there {np.mean([r.value - r.truth for r in judging]):+.3f} +- "
+        f"{np.std([r.value - r.truth for r in judging]):.3f}",
+    )
+
+
+def without(width: float, model: float) -> float:
+    """Half an interval without the model's deviation that it was widened by."""
+    return max(width**2 - (1.96 * model) ** 2, 0.0) ** 0.5
+
+
+def one() -> None:
+    """Single real tosses: friction, and every edge relative to itself."""
+    tracks = [toss(n) for n in recorded_once(range(600))]
+    friction: dict[bool, list[Reading]] = {True: [], False: []}
+    edges: dict[bool, list[Reading]] = {True: [], False: []}
+    for track in tracks:
+        found = learn_contact([track], prior_from_size("box", 0.05), CUBE)
+        half, f = track.toss < SPLIT, found.friction
+        sampling = without(found.spread.friction, intervals.MODEL_FRICTION)
+        friction[half].append(Reading(f.value, TRUE_FRICTION, sampling))
+        for edge, width in zip(found.extents, found.spread.extents_m):
+            left = without(float(width), intervals.MODEL_SIZE * edge.value)
+            edges[half].append(Reading(edge.value, TRUE_EDGE_M, left, edge.value))
+    told("one toss, friction", friction[True], friction[False], intervals.MODEL_FRICTION)
+    told("one toss, edges", edges[True], edges[False], intervals.MODEL_SIZE)
+
+
+def learned_body(seed: int, every: int) -> tuple[ContactLearning, float, float]:
+    """A simulated body of any kind learned from ten tosses at 148 Hz / every, its true friction and its restitution (of
+    a mass on a damped spring: exp(-pi d / sqrt(1 - d^2)))."""
+    rng = np.random.default_rng([77, seed])
+    kind, mu = ("box", "box", "prism", "L-shape")[seed % 4], float(rng.uniform(0.1, 0.5))
+    damping, soft_s = (1.0, 1.0, 0.5, 0.25)[rng.integers(4)], float(np.exp(rng.uniform(*np.log([0.0015, 0.006]))))
+    mm_noise = (0.5, 1.0, 3.0)[rng.integers(3)] if every > 1 else 0.2
+    pieces, truth = any_body(kind, rng)
+    shape = ObjectShape("object", "truth", np.asarray(truth.vertices), np.asarray(truth.faces, dtype=np.int64))
+    physics = uniform_physics(shape, 0.37)
+    made = simulated(pieces, physics, mu, 10, seed, soft_s, damping)
+    tracks = [noisy(t, every, 1e-3 * mm_noise, np.radians(0.5 * mm_noise), seed) for t in made]
+    prior = prior_from_size("box", 0.05) if kind == "box" else held(shape, physics, rng)
+    config = ContactConfig(bootstrap_repeats=12 if every == 1 else 2, penetration=1.0 if kind == "box" else 20.0)
+    began = time.process_time()
+    found = learn_contact(tracks, prior, physics, config=config)
+    f, rebound = found.friction, 0.0 if damping == 1 else float(np.exp(-np.pi * damping / (1 - damping**2) ** 0.5))
+    law = "" if found.restitution is None else f"; restitution {found.restitution.value:.2f}, true {rebound:.2f}"
+    line(
+        f"body {seed}",
+        f"{kind}, rebound damping {damping:g}, {1e3 * soft_s:.1f} ms, noise {mm_noise:g} mm: friction {f.value:.3f} "
+        f"({f.low:.3f} .. {f.high:.3f}), true {mu:.3f}{law}; {time.process_time() - began:.1f} CPU-s",
+    )
+    return found, mu, rebound
+
+
+def bodies(every: int) -> None:
+    """Simulated bodies at 148 Hz / every: friction relative to itself, and restitution where it is learned."""
+    share = intervals.MODEL_SHARE if every == 1 else slow_friction.MODEL_SHARE
+    friction: dict[bool, list[Reading]] = {True: [], False: []}
+    rebounds: dict[bool, list[Reading]] = {True: [], False: []}
+    for seed in range(BODIES):
+        half = seed // 4 % 2 == 0
+        try:
+            found, mu, rebound = learned_body(seed, every)
+        except BadInput as wrong:
+            line(f"body {seed}", f"refused: {wrong}")
+            continue
+        value = found.friction.value
+        friction[half].append(Reading(value, mu, without(found.spread.friction, share * value), value))
+        if found.restitution is not None:
+            e = found.restitution
+            left = without(e.high - e.value, slow_friction.MODEL_RESTITUTION)
+            rebounds[half].append(Reading(e.value, rebound, left))
+    name = "148 Hz" if every == 1 else "30 Hz"
+    told(f"{name}, friction", friction[True], friction[False], share)
+    if rebounds[True]:
+        told(f"{name}, restitution", rebounds[True], rebounds[False], slow_friction.MODEL_RESTITUTION)
+
+
+CASES = {"one": one, "fast": lambda: bodies(1), "slow": lambda: bodies(5)}
+
+
+if __name__ == "__main__":
+    sys.exit(run_cases(CASES, without_data=("fast", "slow")))
