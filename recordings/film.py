@@ -92,7 +92,8 @@ class Film:
         """A line of words below: the toss, the time, the status in its colour."""
         status, time_ns = self.track.status[i], self.track.time_ns
         bar = np.full((BAR_PX, width, 3), BAR_RGB, dtype=np.uint8)
-        words = f"toss {self.track.toss}   frame {i + 1} of {len(self)}   {1e-9 * int(time_ns[i] - time_ns[0]):.2f} s   "
+        time_s = 1e-9 * int(time_ns[i] - time_ns[0])
+        words = f"toss {self.track.toss}   frame {i + 1} of {len(self)}   {time_s:.2f} s   "
         start = 10 + cv2.getTextSize(words, FONT, 0.55, 1)[0][0]
         cv2.putText(bar, words, (10, 21), FONT, 0.55, INK_RGB, 1, cv2.LINE_AA)
         cv2.putText(bar, status, (start, 21), FONT, 0.55, STATUS_RGB[status], 1, cv2.LINE_AA)

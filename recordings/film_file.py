@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 from fractions import Fraction
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -14,8 +15,9 @@ from numpy import ndarray as Array
 
 CODECS = ("libx264", "mpeg4")
 """H.264 where FFmpeg has it, for every player knows it; MPEG-4 part 2 is always there."""
-QUALITY = {"libx264": {"crf": "20", "preset": "medium"}, "mpeg4": {"qscale": "3"}}
-TICKS = 90_000
+QUALITY = {"libx264": {"crf": "20", "preset": "medium"}, "mpeg4": {"qmin": "2", "qmax": "4"}}
+TICKS = 60_000
+"""Per second; MPEG-4 counts at most 65,535."""
 GIF_COLORS = 128
 
 
@@ -34,7 +36,7 @@ def write_mp4(path: Path, images: Iterable[UInt8[Array, "h w 3"]], times_s: Floa
 
     count = 0
     with av.open(str(path), "w", options={"movflags": "faststart"}) as container:
-        stream = container.add_stream(codec, options=QUALITY[codec])
+        stream: Any = container.add_stream(codec, options=QUALITY[codec])
         stream.pix_fmt, stream.time_base = "yuv420p", Fraction(1, TICKS)
         stream.codec_context.time_base = Fraction(1, TICKS)
         for image, time_s in zip(images, times_s, strict=True):

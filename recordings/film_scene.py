@@ -109,7 +109,7 @@ class Stage:
         if world_from_camera is None:
             root_from_camera, table = Transform(ROOT, camera.frame, UPRIGHT, np.zeros(3)), None
         else:
-            root_from_camera = Transform(ROOT, camera.frame, world_from_camera.rotation, world_from_camera.translation_m)
+            root_from_camera = Transform.from_matrix(ROOT, camera.frame, world_from_camera.matrix)
             table = Table.of(toss, camera, world_from_camera, track, shape)
         places, radius_m = path_m(track, shape), _radius_m(shape)
         places = root_from_camera.points(places[np.isfinite(places[:, 0])])
