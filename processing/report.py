@@ -109,8 +109,8 @@ def _physics(document: dict[str, Any]) -> str:
         for r in rows
     )
     return (
-        f"<h2>What was learned of contact</h2><table><tr><th>variant</th>{head}</tr>{body}</table><p>Friction against the "
-        "table and restitution; rollouts: the mean error of the learned model, simulated from the release on. In "
+        f"<h2>What was learned of contact</h2><table><tr><th>variant</th>{head}</tr>{body}</table><p>Friction against "
+        "the table and restitution; rollouts: the mean error of the learned model, simulated from the release on. In "
         "brackets: 95 % intervals.</p>"
     )
 
