@@ -48,7 +48,7 @@ td:first-child,th:first-child{text-align:left}th{background:#f3f3f3}.warn{backgr
 .grid{display:grid;grid-template-columns:repeat(auto-fill,minmax(15em,1fr));gap:1em;align-items:start}
 .grid figure{margin:0}.grid img{width:100%}.why{margin:.2em 0}.shapes{display:flex;flex-wrap:wrap;gap:1em}
 .shapes>*{margin:0;flex:1 1 24em}
-canvas{width:100%;height:30em;border:1px solid #ddd;cursor:grab;touch-action:none}"""
+canvas{width:100%;height:42em;max-height:90vh;border:1px solid #ddd;cursor:grab;touch-action:none}"""
 
 
 def write_report(

@@ -36,7 +36,7 @@
     varying vec3 rgb, n;
     void main() {
       vec3 p = turn * (place / 32767.0) * size; n = turn * normal; rgb = color;
-      gl_Position = vec4(p.x / wide, p.y, -0.15 * p.z, 1.0);
+      gl_Position = vec4(vec2(p.x / wide, p.y) * min(1.0, wide), -0.15 * p.z, 1.0);
     }`);
   shader(gl.FRAGMENT_SHADER, `precision mediump float; varying vec3 rgb, n;
     void main() { gl_FragColor = vec4(rgb * (0.4 + 0.6 * abs(dot(normalize(n), normalize(vec3(-0.35, 0.5, 0.79))))), 1.0); }`);
