@@ -174,7 +174,7 @@ def _of_the_motion(e: Evidence, i: int) -> list[str]:
     speed = speeds_m_s(e.track)
     usual = _usual(speed[speed > 0.1]) if (speed > 0.1).any() else np.inf
     if speed[i] > MUCH * usual:
-        return [f"it is fast, {speed[i]:.1f} m/s (usually {usual:.1f} in motion): blurred"]
+        return [f"it is fast, {speed[i]:.1f} m/s (usually {usual:.1f} in motion), so likely blurred"]
     return ["a hand holds it, and hides a part"] if phase == "held" else []
 
 
