@@ -6,11 +6,11 @@ path of somebody's machine.
 
 from __future__ import annotations
 
-from argparse import ArgumentParser, Namespace
+from argparse import Namespace
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from processing.weights import PUBLISHED, find_weights, fingerprint
 from recordings.errors import BadInput
@@ -33,7 +33,7 @@ class Backends:
     weights: Path | None = None
 
 
-def add_arguments(parser: ArgumentParser) -> None:
+def add_arguments(parser: Any) -> None:
     """`--segmenter NAME --matcher NAME --weights DIR`."""
     parser.add_argument(
         "--segmenter", metavar="NAME", default=SEGMENTERS[0], help=f"masks by one of: {', '.join(SEGMENTERS)}"

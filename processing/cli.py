@@ -40,37 +40,54 @@ def _parser() -> Parser:
         "toss-process                                          # the shipped sample",
         "toss-process sessions/cube --out results/cube --truth recordings/cube_dev_truth",
     )
+    parser.usage = "toss-process [SESSION ...] [--toss I-J] [--out DIR] [--truth DIR] [--model RESULTS] [more, below]"
+    _add_everyday(parser)
+    _add_table(parser.add_argument_group("the paper's table"))
+    add_cycle_arguments(parser)
+    import_module(CONTACT).add_arguments(parser)
+    vision = parser.add_argument_group("masks, features and learned weights")
+    add_masks_argument(vision)
+    backends.add_arguments(vision)
+    _add_developers(parser.add_argument_group("for developers"))
+    parser.set_defaults(work=_work)
+    return parser
+
+
+def _add_everyday(parser: argparse.ArgumentParser) -> None:
+    """What most people need, first in the help."""
     parser.add_argument(
         "sessions", metavar="SESSION", nargs="*", help="session folders, one .mcap file, or `sample` (the default)"
     )
-    parser.add_argument("--variant", metavar="NAME", help=f"a row of the table: {', '.join(NAMES)}")
-    parser.add_argument("--scope", choices=("one", "all"), default="all", help="each toss alone, or all (default)")
     parser.add_argument("--toss", metavar="I|I-J", help="only these tosses")
     parser.add_argument(
         "--out", metavar="DIR", type=Path, help="results folder (SESSION/results; of several sessions DIR/<name>)"
     )
     parser.add_argument("--truth", metavar="DIR", type=Path, help="truth/ or a *_truth folder, opened for scores only")
     parser.add_argument("--model", metavar="RESULTS", type=Path, help="track with a shape that was learned before")
-    parser.add_argument("--start", choices=("truth",), help="truth: the first true pose is given (marked in the table)")
     parser.add_argument(
         "--table-from-depth", action="store_true", help="where the calibration lacks the table: take it from depth"
     )
-    parser.add_argument("--tracker", metavar="NAME", default=TRACKERS[0], help=f"one of: {', '.join(TRACKERS)}")
-    parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="cpu (default) or cuda")
     parser.add_argument(
         "--executor", choices=("local", "slurm"), default="local", help="where several sessions run (local processes)"
     )
-    add_cycle_arguments(parser)
-    add_masks_argument(parser)
-    backends.add_arguments(parser)
-    import_module(CONTACT).add_arguments(parser)
-    parser.set_defaults(work=_work)
-    return parser
+    parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="cpu (default) or cuda")
+
+
+def _add_table(group: Any) -> None:
+    """Which row of the table is made."""
+    group.add_argument("--variant", metavar="NAME", help=f"a row (default: {DEFAULT}) of: {', '.join(NAMES)}")
+    group.add_argument("--scope", choices=("one", "all"), default="all", help="each toss alone, or all (default)")
+
+
+def _add_developers(group: Any) -> None:
+    """What compares and takes apart."""
+    group.add_argument("--tracker", metavar="NAME", default=TRACKERS[0], help=f"one of: {', '.join(TRACKERS)}")
+    group.add_argument("--start", choices=("truth",), help="truth: the first true pose is given (marked in the table)")
 
 
 def add_cycle_arguments(parser: argparse.ArgumentParser) -> None:
     """What the second pass is given; `anew` and `rendered` are the paper's way."""
-    group = parser.add_argument_group("second pass")
+    group = parser.add_argument_group("the paper's second pass")
     group.add_argument(
         "--second-pass", choices=("shape", "poses", "anew"), default="shape",
         help="start from the first pass's poses and shape (default), its poses, or the first pose alone (the paper)",

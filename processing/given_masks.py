@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Mapping
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 from jaxtyping import Bool
 from numpy import ndarray as Array
@@ -13,7 +12,7 @@ GivenMasks = Literal["first", "first-toss", "all", "none"]
 DEFAULT_MASKS: GivenMasks = "first"
 
 
-def add_masks_argument(parser: argparse.ArgumentParser) -> None:
+def add_masks_argument(parser: Any) -> None:
     """`--masks`, for toss-process; its value goes into `Config.given_masks`."""
     parser.add_argument(
         "--masks",

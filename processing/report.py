@@ -15,9 +15,14 @@ from numpy import ndarray as Array
 
 from processing.metrics import distance_to_surface_m
 from processing.report_curves import error_curves, rollout_curves
+from processing.report_loops import SLOWED, toss_loops
+from processing.report_mesh import turning_shapes
 from processing.report_shapes import ERROR_FULL_MM, Shown, shape_picture, true_shape
+from processing.report_worst import Worst, worst_frames
 from processing.table import COLUMNS, Row, said
-from recordings.geometry import CameraModel
+from recordings.codec import decode_image
+from recordings.film import STATUS_RGB
+from recordings.raster import covered_pixels, outlined
 from recordings.results import Results
 from recordings.session import Session
 from recordings.session_writer import write_bytes
@@ -26,13 +31,24 @@ from recordings.tracks import ObjectShape
 if TYPE_CHECKING:
     import trimesh
 
-PICTURES = 6
 TILE_PX = 360
-OUTLINE_RGB = (255, 40, 40)
+PHYSICS = (
+    ("friction", "friction"),
+    ("friction_error", "friction − truth"),
+    ("restitution", "restitution"),
+    ("rollout_track_position", "rollout mm, track"),
+    ("rollout_track_rotation", "rollout deg, track"),
+    ("rollout_position", "rollout mm, truth"),
+    ("rollout_rotation", "rollout deg, truth"),
+)
 STYLE = """body{font:15px/1.5 system-ui,sans-serif;max-width:70em;margin:2em auto;padding:0 1em;color:#222}
 table{border-collapse:collapse;margin:1em 0}td,th{border:1px solid #ccc;padding:.25em .6em;text-align:right}
 td:first-child,th:first-child{text-align:left}th{background:#f3f3f3}.warn{background:#fff4d6;padding:.6em 1em}
-.paper{color:#888}figure{margin:1em 0}img{max-width:100%}.bar{display:inline-block;height:.8em}"""
+.paper{color:#888}figure{margin:1em 0}img{max-width:100%}figcaption,.why{font-size:.85em;color:#555}
+.grid{display:grid;grid-template-columns:repeat(auto-fill,minmax(15em,1fr));gap:1em;align-items:start}
+.grid figure{margin:0}.grid img{width:100%}.why{margin:.2em 0}.shapes{display:flex;flex-wrap:wrap;gap:1em}
+.shapes>*{margin:0;flex:1 1 24em}
+canvas{width:100%;height:42em;max-height:90vh;border:1px solid #ddd;cursor:grab;touch-action:none}"""
 
 
 def write_report(
@@ -46,15 +62,17 @@ def write_report(
     main = _main_row(rows)
     parts = [
         f"<h1>{escape(session.name)}: {escape(session.object_name)}</h1>",
-        _warnings([*said(document["rows"], "warnings"), *_lost(document)]),
+        _warnings([*_lost(document), *said(_main_first(document), "warnings")]),
         _recorded(document, session),
         "<h2>Scores</h2>",
         _score_table(document),
+        _physics(document),
         _shapes(results, rows, truth),
+        _loops(results, main, session),
+        _worst(results, main, session),
         _curves(rows, main),
         _rollouts(results, main),
         _phases_table(main),
-        *(_figure(results, row, session) for row in rows if row is main),
         "<h2>Every toss</h2>",
         *(_toss_table(r) for r in document["rows"]),
         _notes(document),
@@ -70,6 +88,40 @@ def _main_row(rows: Sequence[Row]) -> Row | None:
     """The row that a reader looks at: `ours` over all tosses, else the last one in that scope."""
     wide = [r for r in rows if r.record.scope == "all"] or list(rows)
     return next((r for r in wide if r.record.name == "ours"), wide[-1] if wide else None)
+
+
+def _main_first(document: dict[str, Any]) -> list[dict[str, Any]]:
+    """The rows in the order that a reader cares: `ours` over all tosses, what is over all tosses, the others."""
+    return sorted(document["rows"], key=lambda r: (r["scope"] != "all", r["variant"] != "ours"))
+
+
+def _physics(document: dict[str, Any]) -> str:
+    """What was learned of contact, with its 95 % intervals where they are known."""
+    titles = [(n, t) for n, t in PHYSICS if any(n in r["values"] for r in document["rows"])]
+    rows = [r for r in document["rows"] if any(n in r["values"] for n, _ in titles)]
+    if not rows:
+        return ""
+    head = "".join(f"<th>{title}</th>" for _, title in titles)
+    body = "".join(
+        f"<tr><td>{escape(r['variant'])} ({r['scope']})</td>"
+        + "".join(f"<td>{with_bounds(r['values'].get(name))}</td>" for name, _ in titles)
+        + "</tr>"
+        for r in rows
+    )
+    return (
+        f"<h2>What was learned of contact</h2><table><tr><th>variant</th>{head}</tr>{body}</table><p>Friction against "
+        "the table and restitution; rollouts: the mean error of the learned model, simulated from the release on. In "
+        "brackets: 95 % intervals.</p>"
+    )
+
+
+def with_bounds(value: dict[str, Any] | None) -> str:
+    """A number of table.json with the bounds of its interval, where it has some."""
+    if value is None or value["value"] is None:
+        return "–"
+    form = "{:.3f}" if value["unit"] == "" else "{:.1f}"
+    text, low, high = form.format(value["value"]), value.get("low"), value.get("high")
+    return text if low is None or high is None else f"{text} [{form.format(low)}, {form.format(high)}]"
 
 
 def _shapes(results: Results, rows: Sequence[Row], truth: trimesh.Trimesh | None) -> str:
@@ -93,7 +145,9 @@ def _shapes(results: Results, rows: Sequence[Row], truth: trimesh.Trimesh | None
         "The shape at each step. Upper row: from the camera's side. Below: from the other side; blue was seen by no "
         f"camera.{errors}"
     )
-    return f"<h2>The shape</h2>{_picture(_png(shape_picture(shown)), caption)}"
+    picture = shape_picture(shown)
+    still = f"<div style='flex:0 1 {picture.shape[1]}px'>{_picture(_png(picture), caption)}</div>"
+    return f"<h2>The shape</h2><div class=shapes>{turning_shapes(shown)}{still}</div>"
 
 
 def _true_pose(rows: Sequence[Row], shown: Sequence[Shown]) -> Float[Array, "4 4"] | None:
@@ -241,35 +295,54 @@ def _toss_table(row: dict[str, Any]) -> str:
     return f"<h3>{escape(row['label'])} ({row['scope']})</h3><table><tr>{head}</tr>{body}</table>"
 
 
-def _figure(results: Results, row: Row, session: Session) -> str:
-    picture = outline_picture(results, row, session)
-    data = cv2.imencode(".jpg", picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 88])[1].tobytes()
-    caption = "The estimated shape's outline at its estimated pose, over the images. Frames that are lost show none."
-    name = f"{row.record.label} (scope {row.record.scope})"
-    return f"<h2>{escape(name)}</h2>{_picture(data, caption, 'jpeg')}"
+def _loops(results: Results, row: Row | None, session: Session) -> str:
+    """The flight of every toss, moving."""
+    if row is None:
+        return ""
+    figures = "".join(
+        f"<figure><img alt='toss {loop.toss}' src='data:image/webp;base64,{base64.b64encode(loop.webp).decode()}'>"
+        f"<figcaption>toss {loop.toss}, {SLOWED} times slower</figcaption></figure>"
+        for loop in toss_loops(results, row, session)
+    )
+    if not figures:
+        return ""
+    legend = ", ".join(f"<b style='color:rgb{STATUS_RGB[s]}'>{s}</b>" for s in STATUS_RGB)
+    text = f"The outline of the estimated shape at its estimated pose, by status: {legend} (no outline, red edge)."
+    return f"<h2>Every toss, as seen</h2><p>{escape(row.record.label)}. {text}</p><div class=grid>{figures}</div>"
 
 
-def outline_picture(results: Results, row: Row, session: Session) -> UInt8[Array, "h w 3"]:
-    """Cut-outs of up to PICTURES frames (of three tosses, or of one alone) with the mesh's outline, side by side."""
-    tosses = list(row.tracks)
-    chosen = [tosses[i] for i in np.unique(np.linspace(0, len(tosses) - 1, min(3, len(tosses))).round().astype(int))]
-    tiles = []
-    for toss in chosen:
-        track, frames = row.tracks[toss], session.toss(toss).rgbd(row.tracks[toss].camera)
-        shape = results.shape(row.record.name, row.record.scope, toss)
-        camera = row.record.calibration.camera(track.camera)
-        for share in np.linspace(0.15, 0.98, PICTURES // len(chosen)):
-            position = int(share * (len(frames) - 1))
-            image, pose = frames[position].color_rgb.copy(), track.camera_from_object[position]
-            seen = silhouette(shape, pose, camera) if np.isfinite(pose).all() else np.zeros(image.shape[:2], dtype=bool)
-            tiles.append(_tile(image, seen, f"toss {toss}, frame {position}"))
-    columns = min(3, len(tiles))
-    tiles += [np.zeros_like(tiles[0])] * (-len(tiles) % columns)
-    return np.vstack([np.hstack(tiles[i : i + columns]) for i in range(0, len(tiles), columns)])
+def _worst(results: Results, row: Row | None, session: Session) -> str:
+    """The worst frames with what is unusual in them."""
+    found = [] if row is None else worst_frames(results, row)
+    if row is None or not found:
+        return ""
+    figures = "".join(
+        f"<div>{_picture(_jpeg(worst_tile(results, row, session, w)), _title(w), 'jpeg')}"
+        f"<p class=why>{escape('; '.join(w.reasons))}</p></div>"
+        for w in found
+    )
+    return f"<h2>The worst frames, and why</h2><div class=grid>{figures}</div>"
 
 
-def _tile(image_rgb: UInt8[Array, "h w 3"], mask: Bool[Array, "h w"], title: str) -> UInt8[Array, "th tw 3"]:
-    """The part of the image around the mask (all of it for an empty one), with the outline and a title."""
+def _title(worst: Worst) -> str:
+    return f"toss {worst.toss}, frame {worst.position}: {worst.what}"
+
+
+def worst_tile(results: Results, row: Row, session: Session, worst: Worst) -> UInt8[Array, "h w 3"]:
+    """The cut-out of a frame with the outline in its status's colour; all of the image where it is lost."""
+    track = row.tracks[worst.toss]
+    image = decode_image(session.toss(worst.toss).color(track.camera)[worst.position])
+    pose, mask = track.pose(worst.position), np.zeros(image.shape[:2], dtype=bool)
+    if pose is not None:
+        shape = results.shape(row.record.name, row.record.scope, worst.toss)
+        mask = covered_pixels(shape, pose, row.record.calibration.camera(track.camera))
+    return _tile(image, mask, STATUS_RGB[track.status[worst.position]])
+
+
+def _tile(
+    image_rgb: UInt8[Array, "h w 3"], mask: Bool[Array, "h w"], color: tuple[int, int, int]
+) -> UInt8[Array, "th tw 3"]:
+    """The part of the image around the mask (the middle square for an empty one), with the outline."""
     height, width = mask.shape
     rows, columns = np.nonzero(mask)
     half = height // 2
@@ -282,25 +355,8 @@ def _tile(image_rgb: UInt8[Array, "h w 3"], mask: Bool[Array, "h w"], title: str
     cut = (slice(top, top + 2 * half), slice(left, left + 2 * half))
     tile = cv2.resize(image_rgb[cut], (TILE_PX, TILE_PX), interpolation=cv2.INTER_LINEAR)
     seen = cv2.resize(mask[cut].astype(np.uint8), (TILE_PX, TILE_PX), interpolation=cv2.INTER_NEAREST) > 0
-    draw_outline(tile, seen)
-    cv2.putText(tile, title, (8, 22), cv2.FONT_HERSHEY_SIMPLEX, 0.6, (255, 255, 255), 2)
-    return tile.astype(np.uint8)
+    return outlined(tile.astype(np.uint8), seen, color, 2)
 
 
-def draw_outline(image_rgb: UInt8[Array, "h w 3"], mask: Bool[Array, "h w"]) -> None:
-    """Draw a mask's outline into an image."""
-    contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
-    cv2.drawContours(image_rgb, contours, -1, OUTLINE_RGB, 1)
-
-
-def silhouette(shape: ObjectShape, camera_from_object: Float[Array, "4 4"], camera: CameraModel) -> Bool[Array, "h w"]:
-    """Pixels whose ray, through the lens as it is, meets the shape at this pose."""
-    import open3d
-
-    scene = open3d.t.geometry.RaycastingScene()
-    points = shape.vertices_m @ camera_from_object[:3, :3].T + camera_from_object[:3, 3]
-    tensor = open3d.core.Tensor
-    scene.add_triangles(tensor(points.astype(np.float32)), tensor(shape.faces.astype(np.uint32)))
-    directions = np.nan_to_num(camera.pixel_rays(), nan=0.0).astype(np.float32)
-    rays = np.concatenate([np.zeros_like(directions), directions], -1)
-    return np.isfinite(scene.cast_rays(tensor(rays))["t_hit"].numpy())
+def _jpeg(image_rgb: UInt8[Array, "h w 3"]) -> bytes:
+    return cv2.imencode(".jpg", image_rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 85])[1].tobytes()

@@ -43,9 +43,9 @@ def shape_picture(shown: Sequence[Shown]) -> UInt8[Array, "h w 3"]:
     for s in shown:
         front, back = (_drawn(s, turn, size_m) for turn in (rotation_exp(np.array([-0.35, 0.45, 0.0])),
                        rotation_exp(np.array([0.35, np.pi + 0.45, 0.0]))))  # fmt: skip
-        rows = [_painted(front, _colors(s.shape)), _painted(back, _form_colors(s.shape))]
+        rows = [_painted(front, colors_of(s.shape)), _painted(back, form_colors(s.shape))]
         if any(x.error_m is not None for x in shown):
-            rows.append(_painted(front, _error_colors(s)))
+            rows.append(_painted(front, error_colors(s)))
         column = np.vstack(rows)
         title = np.full((26, PANEL_PX, 3), BACKGROUND, dtype=np.uint8)
         cv2.putText(title, s.title, (6, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (30, 30, 30), 1, cv2.LINE_AA)
@@ -92,13 +92,13 @@ def _painted(d: _Drawing, vertex_rgb: Float[Array, "v 3"]) -> UInt8[Array, "h w 
     return np.where(d.seen[..., None], np.clip(rgb, 0, 255), BACKGROUND).astype(np.uint8)
 
 
-def _colors(shape: ObjectShape) -> Float[Array, "v 3"]:
+def colors_of(shape: ObjectShape) -> Float[Array, "v 3"]:
     if shape.vertex_rgb is None:
         return np.full((len(shape.vertices_m), 3), 200.0)
     return shape.vertex_rgb.astype(np.float64)
 
 
-def _form_colors(shape: ObjectShape) -> Float[Array, "v 3"]:
+def form_colors(shape: ObjectShape) -> Float[Array, "v 3"]:
     """Grey, and blue where no camera saw the surface."""
     rgb = np.full((len(shape.vertices_m), 3), 205.0)
     if shape.observed is not None:
@@ -106,7 +106,7 @@ def _form_colors(shape: ObjectShape) -> Float[Array, "v 3"]:
     return rgb
 
 
-def _error_colors(s: Shown) -> Float[Array, "v 3"]:
+def error_colors(s: Shown) -> Float[Array, "v 3"]:
     """White for none, over yellow to red for ERROR_FULL_MM and more; grey where the truth is not known."""
     if s.error_m is None:
         return np.full((len(s.shape.vertices_m), 3), 225.0)

@@ -19,6 +19,7 @@ EXPORTS = {
     "urdf": ("a simulation-ready URDF with learned mesh, inertia and friction", "RESULTS"),
     "mjcf": ("a simulation-ready MuJoCo model with learned mesh, inertia and friction", "RESULTS"),
     "drake-sdf": ("a simulation-ready SDFormat model for Drake", "RESULTS"),
+    "video": ("a film of every toss: colour with the object's outline, the scene in 3D beside it (MP4)", "RESULTS"),
     "rrd": ("one file for the rerun viewer", "SESSION"),
     "lerobot": ("a LeRobot v3 dataset", "SESSION"),
     "mcap": ("the session with depth in Foxglove's standard schema, for any viewer", "SESSION"),

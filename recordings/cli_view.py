@@ -46,16 +46,19 @@ def _work(args: argparse.Namespace) -> Outcome:
     choice = view.Choice(args.toss, args.variant, args.scope)
     started = time.monotonic()
     written: dict[str, Any] = {}
+    said = ""
     if args.save is not None:
         view.save_rrd(args.path, args.save, choice, progress=progress_for("toss-view --save"))
         written["save"] = args.save
     if args.screenshot is not None:
-        view.screenshot(args.path, args.screenshot, choice)
-        written["screenshot"] = args.screenshot
-    if not written:
+        shot = view.screenshot(args.path, args.screenshot, choice)
+        said = shot.said
+        written |= {"screenshot": args.screenshot} if shot.written else {}
+    if args.save is None and args.screenshot is None:
         view.open_viewer(args.path, choice, progress=progress_for("toss-view"))
-    text = "\n".join(f"wrote {file} ({file.stat().st_size / 1e6:.1f} MB)" for file in written.values())
-    return Outcome({"path": args.path, **written, "seconds": round(time.monotonic() - started, 3)}, text)
+    lines = [f"wrote {file} ({file.stat().st_size / 1e6:.1f} MB)" for file in written.values()]
+    document = {"path": args.path, **written, "seconds": round(time.monotonic() - started, 3), "note": said}
+    return Outcome(document, "\n".join([*lines, *([said] if said else [])]))
 
 
 def _check_names(args: argparse.Namespace) -> None:

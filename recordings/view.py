@@ -21,16 +21,20 @@ from recordings.view_arm import known_arm, log_arm_model, log_arm_motion
 from recordings.view_blueprint import ABOUT, about_text, blueprint
 from recordings.view_bodies import log_bodies, log_rig
 from recordings.view_cycle import log_cycle
+from recordings.view_drawn import drawn_picture
 from recordings.view_file import PipedFile
 from recordings.view_layers import EVENTS, TIME, Clock, Look, Steps, log_toss
 from recordings.view_scene import Scene, moment_ns, result_bodies, results_scene, session_scene
 from recordings.view_track import log_tracking
 from recordings.view_truth import log_truth
-from recordings.view_viewer import Viewer, ViewerFailed, run_rerun
+from recordings.view_viewer import NoGraphics, Viewer, ViewerFailed, run_rerun
 
 APPLICATION = "tosslab"
 RRD_MAGIC = b"RRF2"
 LOOK, SILENT = Look(), Silent()
+NO_DRIVER = "there is no graphics driver (Mesa's: `apt-get install -y libvulkan1 mesa-vulkan-drivers`)"
+DRAWN = "so the picture is drawn in software, without plots and clouds"
+LEFT_OUT = "so the picture is left out: without one, only the colour images of a session can be drawn on"
 
 
 @dataclass(frozen=True)
@@ -40,6 +44,14 @@ class Choice:
     toss: int | None = None
     variant: str | None = None
     scope: str | None = None
+
+
+@dataclass(frozen=True)
+class Shot:
+    """Whether a picture was written; `said`: how it was drawn, or why it was left out, where that needs a word."""
+
+    written: bool
+    said: str = ""
 
 
 def save_rrd(path: Path, out: Path, choice: Choice = Choice(), look: Look = LOOK, progress: Progress = SILENT) -> None:
@@ -82,10 +94,27 @@ def _write(scene: Scene, out: Path, look: Look, progress: Progress) -> None:
 
 def screenshot(
     path: Path, out: Path, choice: Choice = Choice(), look: Look = LOOK, size: tuple[int, int] = (1280, 800)
-) -> None:
-    """Write a PNG of the viewer's window at a telling moment of the first toss (the middle of its flight). No display
-    is needed; a graphics driver is: ViewerFailed says which packages bring one."""
+) -> Shot:
+    """Write a PNG of the viewer's window at a telling moment of the first toss (the middle of its flight).
+
+    No display is needed. Without a graphics driver the moment is drawn in software, or left out where the path is not
+    of a session.
+    """
     scene = None if is_foreign(path) else open_scene(path, choice)
+    said, picture = "", None
+    try:
+        picture = _viewed(path, scene, look, size)
+    except NoGraphics:
+        picture = None if scene is None else drawn_picture(scene, scene.tosses[0])
+        said = f"{NO_DRIVER}, {LEFT_OUT if picture is None else DRAWN}"
+    if picture is not None:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        write_bytes(out, picture)
+    return Shot(picture is not None, said)
+
+
+def _viewed(path: Path, scene: Scene | None, look: Look, size: tuple[int, int]) -> bytes:
+    """The viewer's picture of a scene, or of a file that is not ours."""
     with Viewer(headless=True, size=size) as viewer:
         if scene is None:
             viewer.client.open(str(path.resolve()))
@@ -95,9 +124,7 @@ def screenshot(
             shift_ns = scene.shift_ns[toss]
             viewer.wait_for(TIME, scene.spans_ns[toss][1] + shift_ns)
             viewer.show(TIME, moment_ns(scene, toss) + shift_ns)
-        picture = viewer.picture()
-    out.parent.mkdir(parents=True, exist_ok=True)
-    write_bytes(out, picture)
+        return viewer.picture()
 
 
 def open_viewer(path: Path, choice: Choice = Choice(), look: Look = LOOK, progress: Progress = SILENT) -> None:

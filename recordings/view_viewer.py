@@ -25,7 +25,8 @@ NOTICES_GONE_S = 5.0
 """The viewer greets with notices over its window for about four seconds; no command takes them away."""
 SAME_PICTURES = 3
 """A picture is complete when this many in a row are the same bytes and the viewer reports nothing as loading."""
-NO_ADAPTER = "No graphics adapter was found"
+NO_GRAPHICS = ("No graphics adapter was found", "Failed to get render context")
+"""What the viewer says when it ends because there is no driver, or none that it can draw with."""
 NO_VULKAN = (
     "the viewer found no graphics driver; without a graphics card it draws with Mesa's: "
     "`apt-get install -y libvulkan1 mesa-vulkan-drivers`"
@@ -34,6 +35,10 @@ NO_VULKAN = (
 
 class ViewerFailed(TosslabError):
     """The viewer did not start, or did not come to an end with what it was asked."""
+
+
+class NoGraphics(ViewerFailed):
+    """There is no graphics driver that the viewer could draw with."""
 
 
 def rerun_program() -> str:
@@ -169,6 +174,8 @@ class Viewer:
                 try:
                     client = ViewerClient.connect(self.url)
                     client.get_state()
+                    if self._headless:
+                        client.take_screenshot()  # a driver that is missing shows only when something is drawn
                     self._started_s = time.monotonic()
                     return client
                 except (RuntimeError, ConnectionError, OSError, ValueError):
@@ -180,7 +187,9 @@ class Viewer:
     def _refuse_dead(self) -> None:
         if self._process is not None and self._process.poll() is not None:
             words = self._words()
-            raise ViewerFailed(NO_VULKAN if NO_ADAPTER in words else f"the viewer ended at once: {_gist(words)}")
+            if any(sign in words for sign in NO_GRAPHICS):
+                raise NoGraphics(NO_VULKAN)
+            raise ViewerFailed(f"the viewer ended at once: {_gist(words)}")
 
     def _words(self) -> str:
         if self._log is None:

@@ -29,7 +29,7 @@ MOST_TOSSES_LEARNED = 64
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of `--variant contact-only`."""
-    group = parser.add_argument_group("contact-only")
+    group = parser.add_argument_group("contact from poses alone (--variant contact-only)")
     group.add_argument("--train", metavar="I-J", help="tosses to learn from (default: all but the last)")
     group.add_argument("--test", metavar="I-J", help="tosses to roll out (default: all, the last one marked)")
     group.add_argument(

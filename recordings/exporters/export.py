@@ -19,6 +19,7 @@ EXPORTERS = {
     "urdf": "recordings.exporters.asset:export_urdf",
     "mjcf": "recordings.exporters.asset:export_mjcf",
     "drake-sdf": "recordings.exporters.asset:export_drake_sdf",
+    "video": "recordings.exporters.video:export_video",
     "rrd": "recordings.exporters.rrd:export_rrd",
     "lerobot": "recordings.exporters.lerobot:export_lerobot",
     "mcap": "recordings.exporters.mcap:export_mcap",

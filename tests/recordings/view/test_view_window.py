@@ -7,7 +7,9 @@ import cv2
 import numpy as np
 import pytest
 
-from recordings.view import open_scene, screenshot, stream
+from recordings.cli_view import main
+from recordings.film import STATUS_RGB
+from recordings.view import open_scene, save_rrd, screenshot, stream
 from recordings.view_layers import TIME
 from recordings.view_viewer import LOOPBACK, Viewer, ViewerFailed
 
@@ -29,6 +31,33 @@ def test_without_a_graphics_driver_the_message_names_the_packages(monkeypatch):
     monkeypatch.setenv("WGPU_BACKEND", "vulkan")
     with pytest.raises(ViewerFailed, match=r"apt-get install -y libvulkan1 mesa-vulkan-drivers"), Viewer(headless=True):
         pass
+
+
+@pytest.fixture
+def no_driver(monkeypatch):
+    monkeypatch.setenv("VK_DRIVER_FILES", "nothing.json")
+    monkeypatch.setenv("VK_ICD_FILENAMES", "nothing.json")
+
+
+@pytest.mark.usefixtures("no_driver")
+def test_without_a_graphics_driver_the_picture_is_drawn_in_software_and_that_is_said(session, tmp_path, capsys):
+    assert main([str(session), "--screenshot", str(tmp_path / "s.png")]) == 0
+    assert "there is no graphics driver" in (said := capsys.readouterr().out)
+    assert "drawn in software" in said
+    picture = cv2.imread(str(tmp_path / "s.png"))[..., ::-1]
+    assert (picture == np.array(STATUS_RGB["tracked"])).all(axis=-1).sum() > 50  # the truth's outline
+    assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 50
+
+
+@pytest.mark.usefixtures("no_driver")
+def test_what_cannot_be_drawn_without_a_driver_is_left_out_and_that_is_said(session, tmp_path, capsys):
+    save_rrd(session, tmp_path / "a.rrd")
+    (tmp_path / "s.png").write_bytes(b"older")
+    assert main([str(tmp_path / "a.rrd"), "--screenshot", str(tmp_path / "s.png")]) == 0
+    said = capsys.readouterr().out
+    assert "the picture is left out" in said
+    assert "wrote" not in said
+    assert (tmp_path / "s.png").read_bytes() == b"older"
 
 
 def test_the_viewer_shows_the_streamed_scene_without_complaint(session, viewer):
