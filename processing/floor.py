@@ -12,6 +12,7 @@ import numpy as np
 from processing.field.fuse import fuse
 from processing.field.learn import TossViews, chosen_views
 from processing.field.mesh import grid_mesh
+from processing.frames import every_frame
 from processing.score import Value, chamfers, true_mesh
 from processing.stage import Counts
 from recordings.errors import BadInput
@@ -42,7 +43,7 @@ def coverage_floor(run: Run, record: VariantRecord, truth: Truth) -> dict[str, V
 def _fused(run: Run, toss: int, masks: Path, truth: Truth) -> Path | None:
     """Stage `floor` of one toss; None where the truth has no poses of it."""
 
-    frames = run.frames(toss)
+    frames = every_frame(run, toss)
     track = ObjectTrack.nowhere(toss, run.camera.frame, frames.times_ns)
     poses = truth.camera_from_object(track)
     if poses is None or not np.isfinite(poses).any():

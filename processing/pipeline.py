@@ -25,6 +25,7 @@ from processing.one_shape import of_one_shape
 from processing.segment.static_scene import StaticScene
 from processing.stage import Counts, Done, Store, locked, plain
 from processing.start_pose import StartPose
+from processing.still import Kept, in_every_frame, without_waiting
 from processing.table_plane import with_table_from_depth
 from processing.track.frame_to_model import FrameToModel
 from processing.variants import TRACKERS, WITH_MODEL, Variant
@@ -71,6 +72,8 @@ class Run:
     keys: Mapping[str, str]
     starts: Mapping[int, StartPose] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
+    kept: Mapping[int, Kept] = field(default_factory=dict)
+    """Of tosses with long still stretches, the frames that are worked on: see processing.still."""
     lost: tuple[int, ...] = ()
     """Tosses in which the object is not seen: they show the scene and the robot only."""
 
@@ -118,7 +121,7 @@ def start_run(
     keys = {f"toss_{t:02d}": file_sha256(session.file(t)) for t in tosses}
     physics = json.dumps(session.start.get("object"), sort_keys=True, default=str).encode()
     keys |= {"calibration": _calibration_key(session), "physics": hashlib.sha256(physics).hexdigest()}
-    return Run(session, tuple(tosses), Store(results), config, tracker, device, progress, keys)
+    return without_waiting(Run(session, tuple(tosses), Store(results), config, tracker, device, progress, keys))
 
 
 def _calibration_key(session: Session) -> str:
@@ -251,8 +254,10 @@ def _with_rollouts(run: Run, ended: Pass) -> Pass:
 
 def _record(run: Run, variant: Variant, scope: Scope, last: Pass, masks: Mapping[int, Done]) -> VariantRecord:
     tosses = [
-        TossRecord(t, last.tracks[t].name, last.shapes[t].name, last.masks.get(t, masks[t]).name) for t in run.recorded
-    ]
+        TossRecord(t, in_every_frame(run, t, last.tracks[t]).name, last.shapes[t].name,
+                   in_every_frame(run, t, last.masks.get(t, masks[t])).name)
+        for t in run.recorded
+    ]  # fmt: skip
     contact = {str(t): done.name for t, done in last.contact.items()}
     return VariantRecord(
         name=variant.name,
