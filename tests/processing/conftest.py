@@ -12,7 +12,7 @@ import pytest
 
 from processing.segment.static_scene import SceneSettings, StaticScene, calibrated_table_depth, learn_scene
 from recordings.geometry import CameraModel, Transform, rotation_exp
-from recordings.records import DepthImage, EncodedImage, RgbdFrame, StampedPose
+from recordings.records import ArmStates, DepthImage, EncodedImage, RgbdFrame, StampedPose
 from recordings.session_writer import SessionWriter, write_truth
 from recordings.tracks import RigCalibration
 
@@ -87,6 +87,7 @@ class TinyWorld:
         others: Sequence[int] = (),
         gone: Callable[[int, int], bool] = lambda toss, frame: False,
         seen_again: Callable[[list[RgbdFrame]], list[RgbdFrame]] = lambda frames: frames,
+        arm: ArmStates | None = None,
     ) -> Path:
         """A session of these tosses on disk. In `others` another object is thrown; `gone(toss, frame)`: unseen;
         `seen_again`: what the camera makes of the frames of a toss."""
@@ -96,6 +97,8 @@ class TinyWorld:
                     look = {"box_m": OTHER_M, "faces_rgb": 255 - FACES_RGB[::-1]} if toss in others else {}
                     poses = enumerate(self.poses(frames, toss))
                     seen = [self.see(None if gone(toss, i) else pose, i, **look) for i, pose in poses]
+                    if arm is not None:
+                        writer.arm(arm)
                     if first_mask and seen[0][1].any():
                         writer.mask(0, seen[0][1])
                     for i, frame in enumerate(seen_again([f for f, _ in seen])):
