@@ -14,6 +14,7 @@ from processing.given_masks import add_masks_argument
 from processing.variants import CONTACT_ONLY, DEFAULT, NAMES, TRACKERS, rows_of
 from recordings.console import Outcome, Parser, command_parser, progress_for, run_command
 from recordings.errors import BadInput, TosslabError
+from recordings.notices import Notice
 
 if TYPE_CHECKING:
     from processing.config import Config
@@ -213,7 +214,7 @@ def _started(args: argparse.Namespace, run: Run) -> Run:
     from processing.truth import start_poses
 
     starts = start_poses(args.truth, run.session, run.tosses, "d455")
-    note = "start: the first pose of every toss is the true one (--start truth)"
+    note = Notice("start", "high", "start: the first pose of every toss is the true one (--start truth)")
     return replace(run, starts=starts, warnings=(*run.warnings, note))
 
 

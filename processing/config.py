@@ -14,6 +14,7 @@ from processing.second_pass import CycleConfig
 from processing.segment.follow import BackgroundSettings
 from processing.segment.sighting import FindSettings
 from processing.segment.static_scene import SceneSettings
+from processing.still import StillSettings
 from processing.track.frame_to_model import FrameToModelSettings
 from processing.track.register import RegisterConfig
 from processing.track.sequence import TrackConfig
@@ -24,6 +25,7 @@ class Config:
     """What each stage is run with; saved beside its result in stage.json."""
 
     backends: Backends = field(default_factory=Backends)
+    still: StillSettings = field(default_factory=StillSettings)
     scene: SceneSettings = field(default_factory=SceneSettings)
     rig: RigSettings = field(default_factory=RigSettings)
     masks: BackgroundSettings = field(default_factory=BackgroundSettings)

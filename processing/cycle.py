@@ -25,6 +25,7 @@ from processing.second_pass import CycleConfig, align_stage, input_keys, second_
 from processing.stage import Counts, Done
 from processing.vision import field_stage
 from recordings.geometry import rotation_angle_rad
+from recordings.notices import Notice
 from recordings.results import read_masks, read_shape, read_track, write_shape
 from recordings.session_writer import write_json
 from recordings.tracks import ObjectShape, ObjectTrack
@@ -48,7 +49,7 @@ class Pass:
     contact: Mapping[int, Done] = field(default_factory=dict)
     rollout: Done | None = None
     halves: tuple[Half, ...] = ()
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Notice, ...] = ()
     notes: tuple[str, ...] = ()
     passes: tuple[Mapping[str, Any], ...] = ()
 
@@ -79,14 +80,13 @@ def run_cycle(run: Run, variant: Variant, start: Pass, name: str) -> Pass:
     told = _told(run, start, ended, start.masks, name, losses)
     refined, ended = (replace(x, notes=(*x.notes, *why_no_halves(start.tracks, losses[0]))) for x in (refined, ended))
     if told["worse_share"] > run.config.cycle.much_worse:
-        worse = f"explains the raw images worse by {100 * told['worse_share']:.1f} %"
-        note = f"{name}: the second pass {worse}: kept out, poses and shape are those before it"
-        return replace(refined, passes=(told,), warnings=(*refined.warnings, note))
+        seen = f"{name}: the second pass was not kept: it explains the raw images {_percent(told)} worse than the first"
+        notice = Notice("second pass", "low", seen, "poses and shape are those before it")
+        return replace(refined, passes=(told,), warnings=(*refined.warnings, notice))
     ended = replace(
         ended,
         passes=(told,),
-        warnings=(*ended.warnings, *_said(told)),
-        notes=(*ended.notes, *departures(run.config.cycle)),
+        notes=(*ended.notes, *_said(told, run.config.cycle), *departures(run.config.cycle)),
     )
     return _until_converged(run, ended, name) if variant.refined == "converged" else ended
 
@@ -112,16 +112,21 @@ def with_contact(run: Run, start: Pass, name: str) -> Pass:
     learned = contact_stage(run, name, start.tracks, shape)
     kept_out = learned.counts.get("kept_out")
     if kept_out:
-        return replace(start, warnings=(*start.warnings, f"{name}: contact learning was kept out: {kept_out}"))
+        return replace(start, warnings=(*start.warnings, _contact_kept_out(name, kept_out)))
     vision, corrected = (
         judged_frames(judge_stage(run, name, start.tracks, dict.fromkeys(start.tracks, s), start.masks))
         for s in (shape, learned)
     )
     contact, gap = dict.fromkeys(start.tracks, learned), difference(vision, corrected)
     if gap.worse:
-        note = f"{name}: the shape that contact learned fits the raw depth worse than vision's ({gap}): kept out"
-        return replace(start, contact=contact, warnings=(*start.warnings, note))
+        seen = f"{name}: the shape that contact learned fits the raw depth worse than vision's ({gap}): kept out"
+        notice = Notice("contact", "medium", seen, "friction and rollouts are of that shape", "likely")
+        return replace(start, contact=contact, warnings=(*start.warnings, notice))
     return replace(start, shapes=dict.fromkeys(start.tracks, learned), contact=contact)
+
+
+def _contact_kept_out(name: str, why: str) -> Notice:
+    return Notice("contact", "medium", f"{name}: contact learning was kept out: {why}")
 
 
 def second_pass(run: Run, refined: Pass, masks: Mapping[int, Done], name: str, icp: bool) -> Pass:
@@ -171,7 +176,9 @@ def _until_converged(run: Run, second: Pass, name: str) -> Pass:
         if told["same"]:
             note = f"converged: pass {number} changed nothing more"
             return replace(best, passes=tuple(passes), notes=(*best.notes, note))
-    warning = f"not converged after {run.config.cycle.most_passes} passes more"
+    warning = Notice(
+        "converged", "low", f"poses and shape still change after {run.config.cycle.most_passes} passes more"
+    )
     return replace(best, passes=tuple(passes), warnings=(*best.warnings, warning))
 
 
@@ -184,8 +191,9 @@ def _joint(run: Run, start: Pass, name: str) -> Pass:
     tracks = dict.fromkeys(begun.tracks, solved)
     learned = contact_stage(run, name, tracks, solved)
     kept_out = learned.counts.get("kept_out")
-    warnings = [f"{name}: contact learning was kept out: {kept_out}"] if kept_out else []
-    warnings += [f"{name}: {solved.counts['kept_out']}"] if "kept_out" in solved.counts else []
+    warnings = [_contact_kept_out(name, kept_out)] if kept_out else []
+    if "kept_out" in solved.counts:
+        warnings.append(Notice("joint", "medium", f"{name}: {solved.counts['kept_out']}"))
     ended = replace(begun, tracks=tracks, shapes=tracks, contact={} if kept_out else dict.fromkeys(tracks, learned),
                     warnings=(*start.warnings, *warnings))  # fmt: skip
     return replace(ended, passes=(_told(run, begun, ended, start.masks, name, ({}, {})),))
@@ -225,12 +233,19 @@ def _told(
     }  # fmt: skip
 
 
-def _said(told: Mapping[str, Any]) -> tuple[str, ...]:
+def _said(told: Mapping[str, Any], config: CycleConfig) -> tuple[str, ...]:
+    """Of a second pass that was kept: how it explains the raw images, and what that means."""
     if told["same"]:
-        return (f"{told['of']}: the second pass only repeats the first one",)
+        return (f"{told['of']}: the second pass was kept: it only repeats the first one",)
     if told["worse_share"] > 0:
-        return (f"{told['of']}: the second pass explains the raw images worse by {100 * told['worse_share']:.1f} %",)
-    return ()
+        limit = f"up to {100 * config.much_worse:.0f} % is chance"
+        return (f"{told['of']}: the second pass was kept: it explains the raw images as well as the first "
+                f"({_percent(told)} worse; {limit})",)  # fmt: skip
+    return (f"{told['of']}: the second pass was kept: it explains the raw images better ({_percent(told)})",)
+
+
+def _percent(told: Mapping[str, Any]) -> str:
+    return f"{100 * abs(told['worse_share']):.1f} %"
 
 
 def pose_change(before: Mapping[int, Done], after: Mapping[int, Done]) -> tuple[float, float]:
@@ -259,11 +274,12 @@ def alone_start(run: Run, toss: int, first: Pass, alone: Done, masks: Done) -> P
 
     A toss that is lost in P does not say how O lies in it (it may be another object's): its own shape is taken.
     """
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Notice, ...] = ()
     placed = place_stage(run, toss, first.tracks[toss], alone, first.shapes[toss])
     if not placed.counts["frames"]:
         placed = field_stage(run, f"toss {toss}", {toss: alone}, {toss: masks})
-        warnings = (f"toss {toss} is lost among all tosses: the cycle begins with its own shape",)
+        seen = f"toss {toss} is lost among all tosses: the cycle begins with its own shape"
+        warnings = (Notice("place", "medium", seen),)
     return Pass({toss: alone}, {toss: placed}, {toss: masks}, shared_frame=False, warnings=warnings)
 
 

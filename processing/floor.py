@@ -12,6 +12,7 @@ import numpy as np
 from processing.field.fuse import fuse
 from processing.field.learn import TossViews, chosen_views
 from processing.field.mesh import grid_mesh
+from processing.frames import every_frame
 from processing.score import Value, chamfers, true_mesh
 from processing.stage import Counts
 from recordings.errors import BadInput
@@ -46,7 +47,7 @@ WHERE = "each toss fused at its true poses, rigid ICP"
 
 def _fused(run: Run, toss: int, masks: Path, truth: Truth) -> Path:
     """Stage `floor` of one toss. Raises BadInput where the truth has no poses of it or no frame shows the object."""
-    frames = run.frames(toss)
+    frames = every_frame(run, toss)
     track = ObjectTrack.nowhere(toss, run.camera.frame, frames.times_ns)
     poses = truth.camera_from_object(track)
     if poses is None or not np.isfinite(poses).any():

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from processing.masks import static_scene
 from processing.rig import CAMERA, Rig, rig_stage
 from processing.segment.depth_scale import corrected_depth
+from processing.still import whole_session
 from recordings.records import RgbdFrame
 from recordings.session import RgbdFrames
 
@@ -22,6 +23,11 @@ def corrected_frames(run: Run, toss: int) -> RgbdFrames:
     What depends on these frames depends on the stage `rig`; masks carry its key.
     """
     return with_depth_scale(run.session.toss(toss).rgbd(CAMERA), depth_scale(run))
+
+
+def every_frame(run: Run, toss: int) -> RgbdFrames:
+    """The same of every frame that was recorded, where the run works on some of them only (see processing.still)."""
+    return with_depth_scale(whole_session(run.session).toss(toss).rgbd(CAMERA), depth_scale(run))
 
 
 def depth_scale(run: Run) -> float:

@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING
 
 from processing.cycle import Pass
 from processing.stage import Counts, Done
+from processing.stage_notices import SEE
 from recordings.errors import BadInput
+from recordings.notices import Notice
 from recordings.results import write_track
 from recordings.tracks import ObjectTrack
 
@@ -29,17 +31,24 @@ def without_lost(run: Run, masks: Mapping[int, Done]) -> Run:
     if len(why) == len(run.tosses):
         told = "; ".join(f"toss {t}: {reason}" for t, reason in why.items())
         raise BadInput(f"{run.session.path}: no toss can be tracked ({told}). Look at the masks with `toss-view`")
-    warnings = tuple(f"toss {t}: {reason}: lost, and left out of everything else" for t, reason in why.items())
+    warnings = tuple(
+        Notice("masks", "high", f"toss {t}: {reason}: lost, and left out of everything else", SEE)
+        for t, reason in why.items()
+    )
     kept = tuple(t for t in run.tosses if t not in why)
     return replace(run, tosses=kept, lost=tuple(why), warnings=(*run.warnings, *warnings))
 
 
-def _elsewhere(run: Run, masks: Mapping[int, Done]) -> list[str]:
+def _elsewhere(run: Run, masks: Mapping[int, Done]) -> list[Notice]:
     """Frames that were left out because the object jumps between them and the toss."""
     spans = {t: masks[t].counts.get("elsewhere", []) for t in run.tosses}
     return [
-        f"toss {t}: in frames {first}-{last} the object is at a place from which no motion leads into the toss "
-        "(recorded before it began, or after it): left out"
+        Notice(
+            "masks",
+            "medium",
+            f"toss {t}: in frames {first}-{last} the object is at a place from which no motion leads into the toss "
+            "(recorded before it began, or after it): left out",
+        )
         for t, found in spans.items()
         for first, last in found
     ]

@@ -24,7 +24,9 @@ from processing.masks import object_masks, scene_notes, static_scene
 from processing.one_shape import of_one_shape
 from processing.segment.static_scene import StaticScene
 from processing.stage import Counts, Done, Store, locked, plain
+from processing.stage_notices import of_contact, of_run, of_track
 from processing.start_pose import StartPose
+from processing.still import Kept, in_every_frame, without_waiting
 from processing.table_plane import with_table_from_depth
 from processing.track.frame_to_model import FrameToModel
 from processing.variants import TRACKERS, WITH_MODEL, Variant
@@ -38,6 +40,7 @@ from processing.vision import (
 )
 from recordings.errors import BadInput
 from recordings.geometry import CameraModel
+from recordings.notices import Notice, in_order
 from recordings.progress import Progress
 from recordings.results import (
     Scope,
@@ -70,7 +73,9 @@ class Run:
     progress: MakeProgress
     keys: Mapping[str, str]
     starts: Mapping[int, StartPose] = field(default_factory=dict)
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Notice, ...] = ()
+    kept: Mapping[int, Kept] = field(default_factory=dict)
+    """Of tosses with long still stretches, the frames that are worked on: see processing.still."""
     lost: tuple[int, ...] = ()
     """Tosses in which the object is not seen: they show the scene and the robot only."""
 
@@ -118,7 +123,7 @@ def start_run(
     keys = {f"toss_{t:02d}": file_sha256(session.file(t)) for t in tosses}
     physics = json.dumps(session.start.get("object"), sort_keys=True, default=str).encode()
     keys |= {"calibration": _calibration_key(session), "physics": hashlib.sha256(physics).hexdigest()}
-    return Run(session, tuple(tosses), Store(results), config, tracker, device, progress, keys)
+    return without_waiting(Run(session, tuple(tosses), Store(results), config, tracker, device, progress, keys))
 
 
 def _calibration_key(session: Session) -> str:
@@ -130,8 +135,8 @@ def with_table(run: Run) -> Run:
     scene = StaticScene.read(static_scene(run).folder)
     calibration, found = with_table_from_depth(run.session.calibration, CAMERA, scene.depth_m)
     session = run.session.with_calibration(calibration)
-    note = f"the table is from depth ({100 * found['share']:.0f} % of it, spread {1e3 * found['spread_m']:.1f} mm)"
-    told = f"{note}; gravity is taken to be its normal"
+    seen = f"the table is from depth ({100 * found['share']:.0f} % of it, spread {1e3 * found['spread_m']:.1f} mm)"
+    told = Notice("table", "low", seen, "gravity is taken to be its normal")
     return replace(run, session=session, keys={**run.keys, "calibration": _calibration_key(session)},
                    warnings=(*run.warnings, told))  # fmt: skip
 
@@ -160,7 +165,8 @@ def process_with_model(run: Run, model: Path) -> VariantRecord:
     masks = {t: object_masks(run, t, scene) for t in run.tosses}
     run = without_lost(run, masks)
     tracks = {t: model_track_stage(run, t, masks[t], shape) for t in run.tosses}
-    last = Pass(tracks, dict.fromkeys(run.tosses, shape), masks, shared_frame=True, notes=(f"shape: {model.name}",))
+    last = Pass(tracks, dict.fromkeys(run.tosses, shape), masks, shared_frame=True, warnings=_unfit(tracks),
+                notes=(f"shape: {model.name}",))  # fmt: skip
     record = _record(run, WITH_MODEL, "all", with_lost(run, last, masks), masks)
     with locked(run.store.results / ".variants.lock"):
         write_variant(run.store.results, record)
@@ -169,7 +175,7 @@ def process_with_model(run: Run, model: Path) -> VariantRecord:
 
 def _alone(run: Run, once: Mapping[int, Done], masks: Mapping[int, Done], scope: Scope) -> Pass:
     """p_i, O_i: in scope all only the first toss's shape is looked at."""
-    notes, warnings = ("each toss has its own object frame",), tuple(_unfit(once))
+    notes, warnings = ("each toss has its own object frame",), _unfit(once)
     if run.tracker == FrameToModel.name:
         return Pass(once, once, masks, shared_frame=False, warnings=warnings, notes=notes)
     wanted = run.tosses if scope == "one" else run.tosses[:1]
@@ -178,13 +184,9 @@ def _alone(run: Run, once: Mapping[int, Done], masks: Mapping[int, Done], scope:
     return Pass(once, whose, masks, shared_frame=False, warnings=warnings, notes=notes)
 
 
-def _unfit(once: Mapping[int, Done]) -> list[str]:
+def _unfit(once: Mapping[int, Done]) -> tuple[Notice, ...]:
     """Tosses in which no single rigid motion explains what is seen."""
-    return [
-        f"toss {t}: in {done.counts['unfit']} frames no pose fits: several objects, or one that is not rigid?"
-        for t, done in once.items()
-        if done.counts.get("unfit")
-    ]
+    return tuple(n for t, done in once.items() for n in of_track(t, done))
 
 
 def _all_together(run: Run, once: Mapping[int, Done], masks: Mapping[int, Done]) -> Pass:
@@ -197,24 +199,31 @@ def _all_together(run: Run, once: Mapping[int, Done], masks: Mapping[int, Done])
     together = register_stage(run, dict(once), dict(masks))
     tracks = dict.fromkeys(run.tosses, together)
     left_out = together.counts["not_joined"]
-    warnings = _unfit(once)
-    warnings += (
-        [f"tosses {left_out} could not be brought into the object frame of the others: lost"] if left_out else []
-    )
-    unsure = together.counts.get("ambiguous")
-    if unsure:
-        warnings.append(f"tosses {unsure}: the object looks alike from several sides; their object frame may be turned")
+    warnings = [*_unfit(once), *_unplaced(together)]
     joined = [t for t in run.tosses if t not in left_out]
     shape = field_stage(run, "all tosses", dict.fromkeys(joined, together), {t: masks[t] for t in joined})
     _, apart = of_one_shape(run, together, shape, masks, joined)
     if apart:
         there = tuple(t for t in run.tosses if t not in apart)  # joined anew: they were refined together with the wrong
-        warning = f"tosses {apart}: their place among the others is wrong, no one shape explains both: kept apart"
+        seen = f"tosses {apart}: their place among the others is wrong, no one shape explains both: kept apart"
+        warning = Notice("register", "high", seen, "another object, or one that looks alike from several sides")
         left = _all_together(replace(run, tosses=there), {t: once[t] for t in there}, {t: masks[t] for t in there})
         warnings = [*_unfit({t: once[t] for t in apart}), warning, *left.warnings]
         return replace(left, shared_frame=False, warnings=tuple(warnings))
     return Pass(tracks, dict.fromkeys(run.tosses, shape), {t: masks[t] for t in run.tosses}, shared_frame=True,
                 warnings=tuple(warnings))  # fmt: skip
+
+
+def _unplaced(together: Done) -> list[Notice]:
+    """Tosses that are not in the object frame of the others, or not surely."""
+    found, left_out, unsure = [], together.counts["not_joined"], together.counts.get("ambiguous")
+    if left_out:
+        seen = f"tosses {left_out} could not be brought into the object frame of the others: lost"
+        found.append(Notice("register", "high", seen, "another object, or none of its sides that the others show"))
+    if unsure:
+        seen = f"tosses {unsure}: the object looks alike from several sides; their object frame may be turned"
+        found.append(Notice("register", "high", seen, "compare their frames in `toss-view RESULTS`", "possible"))
+    return found
 
 
 def _with_apart(run: Run, last: Pass, once: Mapping[int, Done], masks: Mapping[int, Done]) -> Pass:
@@ -246,14 +255,19 @@ def _with_rollouts(run: Run, ended: Pass) -> Pass:
     """The paper's Figure 4 on the row's last tracks and shape."""
     done = rollout_stage(run, "all tosses", ended.tracks, next(iter(ended.shapes.values())))
     why = done.counts.get("kept_out")
-    return replace(ended, warnings=(*ended.warnings, f"no rollouts: {why}")) if why else replace(ended, rollout=done)
+    if not why:
+        return replace(ended, rollout=done)
+    return replace(ended, warnings=(*ended.warnings, Notice("rollout", "low", f"no rollouts: {why}")))
 
 
 def _record(run: Run, variant: Variant, scope: Scope, last: Pass, masks: Mapping[int, Done]) -> VariantRecord:
     tosses = [
-        TossRecord(t, last.tracks[t].name, last.shapes[t].name, last.masks.get(t, masks[t]).name) for t in run.recorded
-    ]
+        TossRecord(t, in_every_frame(run, t, last.tracks[t]).name, last.shapes[t].name,
+                   in_every_frame(run, t, last.masks.get(t, masks[t])).name)
+        for t in run.recorded
+    ]  # fmt: skip
     contact = {str(t): done.name for t, done in last.contact.items()}
+    of_stages = [*of_run(run, static_scene(run), masks), *(n for d in last.contact.values() for n in of_contact(d))]
     return VariantRecord(
         name=variant.name,
         scope=scope,
@@ -266,7 +280,7 @@ def _record(run: Run, variant: Variant, scope: Scope, last: Pass, masks: Mapping
         contact=next(iter(contact.values()), None) if scope == "all" else None,
         shared_object_frame=last.shared_frame,
         session_path=os.path.relpath(run.session.path.resolve(), run.store.results.resolve()),
-        warnings=(*run.warnings, *last.warnings),
+        warnings=in_order((*run.warnings, *last.warnings, *of_stages)),
         notes=(f"tracker: {run.tracker}", *scene_notes(run), *last.notes),
         extra={
             "tracker": run.tracker,

@@ -112,7 +112,9 @@ class RobotOfSession:
     def missing(self, tosses: tuple[int, ...]) -> str | None:
         """Why no robot can be drawn in any of these tosses."""
         if all(self.path(t) is None for t in tosses):
-            return "no joint states of a Franka Panda in these tosses"
+            named = [s.joint_names for t in tosses if (s := self._session.toss(t).arm_states()) is not None]
+            other = f"; the recorded joints are {', '.join(named[0])}" if named else ""
+            return f"no joint states of a Franka Panda in these tosses{other}"
         return "no base pose in the calibration" if self.camera_from_base is None else None
 
 

@@ -252,14 +252,15 @@ def shape_values(
     variant's one shape lies after the alignment by ICP."""
     if record.scope == "all":
         first = _first_in_frame_of(results, record, shifts)
-        placing = np.eye(4) if first is None else shifts[first]
-        pairs = [(results.shape(record.name, "all"), placing)]
+        placing = None if first is None else shifts[first]
+        pairs = [(results.shape(record.name, "all"), np.eye(4) if placing is None else placing)]
         where = "not aligned: no first frame is known" if first is None else f"first frame of toss {first}"
     else:
+        own = _with_own_shape(results, record)
         pairs = [
             (results.shape(record.name, "one", t), np.eye(4) if shift is None else shift)
             for t, shift in shifts.items()
-            if t in _with_own_shape(results, record)
+            if t in own
         ]
         where = "each toss's first frame (not at all where that is lost), mean over tosses with a shape"
     scored = [chamfers(shape, shift, truth) for shape, shift in pairs if len(shape.faces)]

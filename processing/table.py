@@ -10,6 +10,7 @@ from typing import Any, Literal
 from processing.learned_values import learned_values
 from processing.score import TossScore, Value, VariantScore
 from processing.variants import ROWS, TABLE, WITH_MODEL
+from recordings.notices import Notice, in_order, said_of
 from recordings.results import Results, VariantRecord
 from recordings.session_writer import write_bytes, write_json
 from recordings.tracks import ObjectTrack
@@ -96,7 +97,7 @@ def _row_document(results: Results, row: Row) -> dict[str, Any]:
             {"toss": toss, "state": row.state(toss), **status_counts(track), **_toss_values(score, toss)}
             for toss, track in row.tracks.items()
         ],
-        "warnings": [*record.warnings, *(score.warnings if score else ("no ground truth: nothing could be scored",))],
+        "warnings": [n.to_json() for n in in_order((*record.warnings, *_of_score(score)))],
         "notes": list(record.notes),
         "stages": {s: results.stage(s).get("key", "") for s in stages},
         "paper": None if paper is None else dict(zip(("adds_auc", "add_auc", "success_5deg_5cm", "cd"), paper)),
@@ -140,13 +141,15 @@ def _legend(rows: Sequence[dict[str, Any]]) -> list[str]:
 
 
 def said(rows: Sequence[dict[str, Any]], kind: Literal["warnings", "notes"]) -> list[str]:
-    """What is said of the rows, each sentence once, with the rows that it is said of before it."""
-    whose: dict[str, list[str]] = {}
-    for row in rows:
-        for line in row[kind]:
-            whose.setdefault(line, []).append(f"{row['variant']} ({row['scope']})")
-    every = len(rows) if len(rows) > 1 else 0
-    return [f"{'every row' if len(of) == every else ', '.join(of)}: {line}" for line, of in whose.items()]
+    """What is said of the rows, by weight, each sentence once, with the rows that it is said of before it."""
+    whose = [(f"{row['variant']} ({row['scope']})", Notice.from_json(n)) for row in rows for n in row[kind]]
+    return said_of(whose, "every row", len(rows))
+
+
+def _of_score(score: VariantScore | None) -> list[Notice]:
+    if score is None:
+        return [Notice("score", "low", "no ground truth: nothing could be scored")]
+    return [Notice("score", "medium", sentence) for sentence in score.warnings]
 
 
 def _block(rows: Sequence[dict[str, Any]]) -> list[str]:
@@ -218,17 +221,19 @@ def _finite(value: Any) -> Any:
 
 
 def summary(documents: Sequence[dict[str, Any]]) -> str:
-    """A line per session: its best row's scores, or why it failed."""
+    """A line per session: its best row's scores, or why it failed; then what must be known of each."""
     titles = ["session", "variant", "tosses", "lost", *(title for _, title in COLUMNS)]
     lines = ["| " + " | ".join(titles) + " |", "|---|---|" + "---:|" * (len(titles) - 2)]
-    failed = []
+    failed, whose = [], []
     for document in documents:
         rows = [r for r in document.get("rows", []) if r["scope"] == "all"] or document.get("rows", [])
         if not rows:
             failed.append(f"{document['session']}: {document.get('error', 'no result')}")
             continue
+        whose += [(str(document["session"]), Notice.from_json(n)) for r in rows for n in r["warnings"]]
         row = next((r for r in rows if r["variant"] == "ours"), rows[-1])
         cells = [str(document["session"]), row["variant"], str(len(row["tosses"]))]
         cells += [str(sum(t["lost"] for t in row["per_toss"])), *(_cell({**row, "paper": None}, n) for n, _ in COLUMNS)]
         lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join([*lines, *([""] if failed else []), *failed])
+    said_below = [*failed, *(f"- {line}" for line in said_of(whose, "every session", len(documents)))]
+    return "\n".join([*lines, *([""] if said_below else []), *said_below])

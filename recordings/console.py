@@ -20,13 +20,14 @@ import math
 import os
 import sys
 import traceback
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NoReturn
 
 from recordings.errors import TosslabError
-from recordings.progress import Console, Progress
+from recordings.progress import Console, Log, Progress
 
 DONE, FELL_SHORT, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 
@@ -108,14 +109,27 @@ def run_command(parser: Parser, argv: Sequence[str] | None = None) -> int:
     if work is None:
         parser.print_help(sys.stderr)
         return BAD_INPUT
-    with _stdout_kept_clean(as_json):
+    with _stdout_kept_clean(as_json), without_library_warnings():
         outcome = _guarded(work, args, parser.prog)
     return _print(outcome, as_json)
 
 
+_log = Log()
+
+
 def progress_for(label: str) -> Progress:
     """Progress on stderr, shown when the work takes over two seconds."""
-    return Console(label)
+    return Console(label, log=_log)
+
+
+@contextlib.contextmanager
+def without_library_warnings() -> Iterator[None]:
+    """What libraries warn their programmers of is not for a user. Python's own options (-W, PYTHONWARNINGS) bring it
+    back."""
+    with warnings.catch_warnings():
+        if not sys.warnoptions:
+            warnings.simplefilter("ignore")
+        yield
 
 
 def json_text(document: Mapping[str, Any]) -> str:

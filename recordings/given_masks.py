@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 
-from jaxtyping import Bool
+from jaxtyping import Bool, Int64
 from numpy import ndarray as Array
 
 from recordings.codec import decode_mask
@@ -30,6 +30,12 @@ class GivenMasks(Mapping):  # not Mapping[int, Bool[Array, "h w"]]: type checks 
 
     def __getitem__(self, position: int) -> Bool[Array, "h w"]:
         return decode_mask(self.png(position), self._names[position])
+
+    def relabelled(self, to: Sequence[int] | Int64[Array, " n"]) -> GivenMasks:
+        """The same masks where frame i is called to[i]; those of frames beyond are left out."""
+        found = GivenMasks(self._file)
+        found._names = {int(to[i]): name for i, name in self._names.items() if i < len(to)}
+        return found
 
     def png(self, position: int) -> bytes:
         """A mask's bytes as they were attached."""

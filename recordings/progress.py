@@ -37,44 +37,118 @@ class Stream(Protocol):
     def isatty(self) -> bool: ...
 
 
+class Log:
+    """When a stream that is no terminal was last written to: all stages of a run share one, so that together they
+    write a line every ten seconds at most."""
+
+    EVERY_S = 10.0
+
+    def __init__(self) -> None:
+        self._last_s = -float("inf")
+
+    def due(self, now_s: float) -> bool:
+        """Whether a line may be written now; then it counts as written."""
+        if now_s - self._last_s < self.EVERY_S:
+            return False
+        self._last_s = now_s
+        return True
+
+
+class Pace:
+    """How fast work goes on, from the steps told so far: an estimate only where the older and the newer half of them
+    agree; where they do not, the older half is forgotten. What is slow once (loading, compiling) then makes no
+    estimate, rather than a wrong one."""
+
+    LEAST_S = 4.0
+    """Watched for so long before anything is foretold."""
+    AGREE = 2.0
+    """The paces of both halves differ by less than this factor."""
+
+    def __init__(self) -> None:
+        self._told: list[tuple[float, int]] = []
+        self._total = 0
+
+    def told(self, now_s: float, done: int, total: int) -> None:
+        """Another step. Where the work is another one (it starts anew, or has another size), so is the pace."""
+        if self._told and (done < self._told[-1][1] or total != self._total):
+            self._told.clear()
+        self._total = total
+        if not self._told or done > self._told[-1][1]:
+            self._told.append((now_s, done))
+        if self._watched() and not self._agree():
+            self._told = self._told[self._middle() :]
+
+    def left_s(self, now_s: float) -> float | None:
+        """Seconds still to go; None where nobody can know."""
+        if not self._watched():
+            return None
+        end_s, done = self._told[-1]
+        each_s, waited_s = _seconds_each(self._told[self._middle()], self._told[-1]), now_s - end_s
+        if waited_s > self.AGREE * each_s + self.LEAST_S:  # a step that takes longer than those before it
+            return None
+        return max(each_s * (self._total - done) - waited_s, 0.0)
+
+    def _watched(self) -> bool:
+        return len(self._told) > 2 and self._told[-1][0] - self._told[0][0] >= self.LEAST_S
+
+    def _middle(self) -> int:
+        """The step nearest to the middle of the time that was watched."""
+        half_s = 0.5 * (self._told[0][0] + self._told[-1][0])
+        return min(range(1, len(self._told) - 1), key=lambda i: abs(self._told[i][0] - half_s))
+
+    def _agree(self) -> bool:
+        middle = self._told[self._middle()]
+        older, newer = _seconds_each(self._told[0], middle), _seconds_each(middle, self._told[-1])
+        return max(older, newer) <= self.AGREE * min(older, newer)
+
+
+def _seconds_each(first: tuple[float, int], last: tuple[float, int]) -> float:
+    return (last[0] - first[0]) / (last[1] - first[1])
+
+
 class Console:
-    """One line on stderr with an estimate, shown only when the work takes over two seconds."""
+    """One line on stderr with an estimate, shown only when the work takes over two seconds. On a terminal it is written
+    over; elsewhere `log` says when there may be another."""
 
     FIRST_SHOWN_S = 2.0
+    EVERY_S = 0.2
 
-    def __init__(self, label: str, stream: Stream | None = None) -> None:
+    def __init__(self, label: str, stream: Stream | None = None, log: Log | None = None) -> None:
         self._label = label
         self._stream: Stream = stream if stream is not None else sys.stderr
-        self._every_s = 0.2 if self._stream.isatty() else 10.0
+        self._log = None if self._stream.isatty() else log or Log()
         self._started_s = time.monotonic()
         self._shown_s: float | None = None
-        self._begun: tuple[int, float] | None = None
-        """The first step that was told, and when: what came before it (loading, compiling) is not part of the pace."""
+        self._ended = False
+        self._pace = Pace()
 
     def step(self, done: int, total: int, note: str = "") -> None:
         now = time.monotonic()
-        self._begun = self._begun or (done, now)
-        elapsed = now - self._started_s
-        last = done >= total
-        due = self._shown_s is None or now - self._shown_s >= self._every_s or last
-        if elapsed < self.FIRST_SHOWN_S or not due:
+        self._pace.told(now, done, total)
+        elapsed, last = now - self._started_s, done >= total
+        if elapsed < self.FIRST_SHOWN_S or (last and self._ended) or not self._due(now, last):
             return
-        self._shown_s = now
-        estimate = "" if last else self._estimate(done, total, now)
-        text = f"{self._label}: {done}/{total} {note} ({elapsed:.0f} s{estimate})"
-        if self._stream.isatty():
-            text = f"\r\x1b[K{text}" + ("\n" if last else "")
-        else:
-            text += "\n"
-        self._stream.write(text)
-        self._stream.flush()
+        self._shown_s, left_s = now, None if last else self._pace.left_s(now)
+        note, left = f" {note}" if note else "", "" if left_s is None else f", about {_words(left_s)} left"
+        self._write(f"{self._label}: {done}/{total}{note} ({_words(elapsed)}{left})", last)
 
     def value(self, name: str, value: float, *, at: int) -> None:
         pass
 
-    def _estimate(self, done: int, total: int, now: float) -> str:
-        """How long the rest takes at the pace since the first step (or since the beginning, where steps are big)."""
-        first, begun_s = self._begun or (done, now)
-        if done == first:
-            first, begun_s = 0, self._started_s
-        return f", about {(now - begun_s) / (done - first) * (total - done):.0f} s left" if done > 1 else ""
+    def _due(self, now: float, last: bool) -> bool:
+        if self._log is not None:
+            return self._log.due(now)
+        return last or self._shown_s is None or now - self._shown_s >= self.EVERY_S
+
+    def _write(self, text: str, last: bool) -> None:
+        if self._log is not None:
+            self._stream.write(f"{text}\n")
+        else:
+            self._stream.write(f"\r\x1b[K{text}" + ("\n" if last else ""))
+        self._ended = last
+        self._stream.flush()
+
+
+def _words(seconds: float) -> str:
+    """Seconds up to two minutes, then minutes."""
+    return f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:.0f} min"

@@ -26,6 +26,7 @@ from recordings.codec import decode_mask
 from recordings.documents import read_json
 from recordings.errors import BadInput, DamagedFile
 from recordings.limits import open_npz, read_npy
+from recordings.notices import Notice
 from recordings.session_writer import write_bytes, write_json
 from recordings.shape_file import read_shape, write_shape
 from recordings.tracks import ContactModel, ObjectShape, ObjectTrack, RigCalibration, Status
@@ -228,7 +229,7 @@ class VariantRecord:
     contact: str | None = None
     shared_object_frame: bool = False
     session_path: str = ""
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Notice, ...] = ()
     notes: tuple[str, ...] = ()
     extra: Mapping[str, Any] = field(default_factory=dict)
 
@@ -246,7 +247,7 @@ def write_variant(results: Path, record: VariantRecord) -> Path:
     document = {k: v for k, v in vars(record).items() if k not in ("calibration", "tosses", "extra")}
     document |= {
         "format_version": RESULTS_FORMAT,
-        "warnings": list(record.warnings),
+        "warnings": [n.to_json() for n in record.warnings],
         "notes": list(record.notes),
         "tosses": [vars(t) for t in record.tosses],
         "calibration": record.calibration.to_json(),
@@ -268,7 +269,7 @@ def _read_variant(path: Path) -> VariantRecord:
                 **document,
                 "calibration": RigCalibration.from_json(document["calibration"]),
                 "tosses": tuple(TossRecord(**t) for t in document["tosses"]),
-                "warnings": tuple(document.get("warnings", ())),
+                "warnings": tuple(Notice.from_json(n) for n in document.get("warnings", ())),
                 "notes": tuple(document.get("notes", ())),
             }
         )

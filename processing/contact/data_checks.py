@@ -170,6 +170,23 @@ def impact_angle(tosses: Sequence[PoseSeries], inertia: Float[Array, "3 3"]) -> 
     return (across / along if along > 0 else 0.0), count
 
 
+class OtherReading(BadInput):
+    """Impacts that fit the orientations only when these are read in another way. `of_own_tracks` is what to say where
+    the poses are vision's: nobody read them wrongly, so they are off."""
+
+    def __init__(self, misfit: float, other: float, reading: str) -> None:
+        super().__init__(
+            f"impacts do not fit the orientations (misfit {misfit:.2f}), but they do ({other:.2f}) when the rotations "
+            f"are {reading}; import the data again in that reading"
+        )
+        self.of_own_tracks = (
+            f"at impacts the tracked object does not turn as a rigid body that is hit would (misfit {misfit:.2f}, "
+            "wanted below 0.3): most likely its orientation is off (blur, or an object that looks alike from several "
+            "sides: look at the impacts with `toss-view`), less likely the table's place is (`toss-calibrate table "
+            "SESSION`)"
+        )
+
+
 def check_orientations(tosses: Sequence[PoseSeries], inertia: Float[Array, "3 3"]) -> float:
     """How far impacts are from a right angle (0..1). Raises BadInput where another reading of the rotations fits
     far better."""
@@ -179,11 +196,7 @@ def check_orientations(tosses: Sequence[PoseSeries], inertia: Float[Array, "3 3"
     for name, read in READINGS.items():
         other, _ = impact_angle([read(s) for s in tosses], inertia)
         if here > 0.3 and other < 0.6 * here:
-            raise BadInput(
-                f"impacts do not fit the orientations (misfit {here:.2f}), but they do ({other:.2f}) when the "
-                "rotations are "
-                f"{name}; import the data again in that reading"
-            )
+            raise OtherReading(here, other, name)
     return here
 
 
@@ -271,12 +284,22 @@ def check_plane(heights_m: Mapping[int, float], what: str) -> float | None:
         side = "above" if height > 0 else "below"
         raise BadInput(
             f"at rest the lowest point of {what} is {abs(height) * 1e3:.1f} mm {side} the plane (median of "
-            f"{len(heights_m)} "
-            f"tosses); wanted within {PLANE_TOLERANCE_M * 1e3:.0f} mm: calibrate the plane (`toss-calibrate table "
-            "SESSION`) "
-            "or check the size of the shape"
+            f"{len(heights_m)} tosses); wanted within {PLANE_TOLERANCE_M * 1e3:.0f} mm. {_causes(heights_m)}"
         )
     return height
+
+
+def _causes(heights_m: Mapping[int, float]) -> str:
+    """Why a resting object is not on the plane, the likeliest first: a wrong plane or size is off by as much in every
+    toss, wrong poses are not."""
+    poses = "the poses at rest (look at them with `toss-view`) or parts of the shape that were not seen"
+    plane = "the plane (`toss-calibrate table SESSION`) or the size of the shape"
+    off = np.array(list(heights_m.values()))
+    if len(off) < 2:
+        return f"One toss cannot tell which is wrong: {poses}, or {plane}"
+    if np.abs(off - np.median(off)).max() > 0.5 * abs(float(np.median(off))):
+        return f"Tosses differ, so most likely wrong are {poses}; less likely {plane}"
+    return f"Every toss says the same, so most likely wrong is {plane}; less likely {poses}"
 
 
 def plane_warning(height_m: float | None, std_m: float | None) -> str | None:
@@ -292,9 +315,9 @@ def plane_warning(height_m: float | None, std_m: float | None) -> str | None:
         return None
     return (
         f"the poses in which the plane carries the object put it {1e3 * abs(height_m):.0f} +- {1e3 * std_m:.0f} mm "
-        f"{side} where it was said to be, {but}; the size is then too {size} by about twice as much: "
-        "put the plane right (`toss-calibrate table SESSION`; without cameras: residuals.table of calibration.json, "
-        "normal_world and offset_m)"
+        f"{side} where it was said to be, {but}; the size is then too {size} by about twice as much. Most likely the "
+        "plane is off (`toss-calibrate table SESSION`; without cameras: residuals.table of calibration.json, "
+        "normal_world and offset_m), less likely the heights of the poses"
     )
 
 

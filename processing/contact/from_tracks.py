@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray as Array
 
 from processing.contact.choice import ClassName, GeometryChoice, choose_geometry, measured_prior, start_points
-from processing.contact.data_checks import check_plane, lowest_point_m
+from processing.contact.data_checks import OtherReading, check_plane, lowest_point_m
 from processing.contact.evaluate import FIGURE_4_STEPS, Evaluation, evaluate
 from processing.contact.fit import FRICTION, Model, fit_lbfgs
 from processing.contact.fuse import Field, FusionConfig, Readings, Sizes, Surface, likely_sizes, thinned
@@ -32,7 +32,7 @@ from processing.contact.loss import REFERENCE_MASS_KG, contact_loss, find_contac
 from processing.contact.motion import GRAVITY_M_S2, PoseSeries
 from processing.contact.plane import Plane
 from processing.contact.prior import Prior
-from processing.contact.result import result_document, warnings_of
+from processing.contact.result import left_out_notice, result_document, warnings_of
 from processing.contact.support import surface_samples
 from recordings.errors import BadInput
 from recordings.geometry import Transform
@@ -108,7 +108,10 @@ def learn_from_tracks(
     series = [s for s in series_of(tracks, world_from_camera) if s.toss not in left_out]
     if not series:
         raise BadInput("no toss can be learned from: " + "; ".join(f"toss {t}: {why}" for t, why in left_out.items()))
-    return learn_from_series(series, shape, plane, physics, config, progress, left_out)
+    try:
+        return learn_from_series(series, shape, plane, physics, config, progress, left_out)
+    except OtherReading as wrong:
+        raise BadInput(wrong.of_own_tracks) from wrong
 
 
 def learn_from_series(
@@ -318,8 +321,11 @@ def _document(
         "plane": {"offset_m": plane.offset_m, "normal": list(map(float, plane.normal_world)), "source": plane.source},
         "left_out": {str(t): why for t, why in left_out.items()},
         "warnings": [
-            *(f"toss {t} was left out: {why}" for t, why in left_out.items() if t not in learning.left_out),
-            *warnings_of(learning),
+            n.to_json()
+            for n in (
+                *(left_out_notice(t, why) for t, why in left_out.items() if t not in learning.left_out),
+                *warnings_of(learning),
+            )
         ],
     }
 

@@ -27,12 +27,12 @@ PRIOR_FRICTION, PRIOR_SIZE_M = 0.3, 0.02
 CONTACT_LASTS_S = 0.05
 DIFFERENCE_FRICTION, DIFFERENCE_SIZE = 0.02, 0.03
 """Steps of the numerical derivatives: of friction and of the relative size. They reach over the kinks of the loss,
-where
-another point becomes the lowest: closer by, a kink would pass for certainty."""
+where another point becomes the lowest: closer by, a kink would pass for certainty."""
 MODEL_FRICTION, MODEL_SIZE = 0.020, 0.10
 """Standard deviations (size: relative) that one toss leaves because the model is not the world (a rebound, a tilt of
-the plane, corners that never touched): from these on the intervals of 95 % of 191 single real tosses hold the truth. Of 175
-other recordings those of friction then hold it in 99 %, those of edges in 96 % (tools/bench_intervals.py one)."""
+the plane, corners that never touched): from these on the intervals of 95 % of 191 single real tosses hold the truth.
+Of 175 other recordings those of friction then hold it in 99 %, those of edges in 96 % (tools/bench_intervals.py
+one)."""
 
 
 MODEL_SHARE = 0.07

@@ -11,6 +11,7 @@ import numpy as np
 from processing.contact.data_checks import plane_warning
 from processing.contact.evaluate import Evaluation
 from processing.contact.learn import ContactLearning
+from recordings.notices import Notice, in_order
 
 PLANE_NOTE = (
     "the height of the plane and the size of the object are nearly one: of poses alone only those that the plane "
@@ -73,22 +74,32 @@ def _noise(learning: ContactLearning) -> dict[str, float]:
     return {"position_m": float(np.median(values[:, 0])), "rotation_rad": float(np.median(values[:, 1]))}
 
 
-def warnings_of(learning: ContactLearning) -> list[str]:
+def warnings_of(learning: ContactLearning) -> list[Notice]:
     """What a reader must know before the numbers."""
-    found = [f"toss {t} was left out: {why}" for t, why in learning.left_out.items()]
+    found = [left_out_notice(t, why) for t, why in learning.left_out.items()]
     if learning.unexplained:
         count = sum(len(f) for f in learning.unexplained.values())
-        found.append(f"{count} transitions were left out: the plane cannot explain their impacts")
+        seen = f"{count} moments of contact were not learned from: the plane cannot explain their impacts"
+        do = "most often the track is off there, else something other than the table was hit"
+        found.append(Notice("contact", "medium", seen, do))
     if learning.solver_failures:
-        found.append(f"{learning.solver_failures} inner problems were not solved at the end")
+        seen = f"{learning.solver_failures} moments of contact could not be solved for their forces at the end"
+        found.append(Notice("contact", "medium", seen, "friction and shape are less sure than their intervals"))
     if learning.untouched_vertices:
         count, of = len(learning.untouched_vertices), len(learning.touched)
-        found.append(f"{count} of {of} points were never touched: the prior shape stands there")
+        seen = f"{count} of {of} points were never touched: the shape from before stands there"
+        found.append(Notice("contact", "low", seen))
     if (plane := plane_warning(*(learning.checks.get(f"plane_by_touch{n}_m") for n in ("", "_std")))) is not None:
-        found.append(plane)
+        found.append(Notice("contact", "high", plane, sure="likely"))
     if len(learning.tosses) == 1:
-        found.append("one toss only: its intervals come from the loss's curvature, and are wide")
+        seen = "contact was learned from one toss only: its intervals come from that toss alone, and are wide"
+        found.append(Notice("contact", "low", seen, "record more tosses"))
     return found
+
+
+def left_out_notice(toss: int, why: str) -> Notice:
+    """Of a toss that contact was not learned from."""
+    return Notice("contact", "medium", f"contact was not learned from toss {toss}: {why}")
 
 
 def result_text(learning: ContactLearning, evaluation: Evaluation | None, warnings: Sequence[str] = ()) -> str:
@@ -96,7 +107,7 @@ def result_text(learning: ContactLearning, evaluation: Evaluation | None, warnin
     f = learning.friction
     edges = " x ".join(f"{s.value * 1e3:.1f}" for s in learning.extents)
     half = ", ".join(f"{(s.high - s.low) / 2e-3:.1f}" for s in learning.extents)
-    lines = [f"warning: {w}" for w in (*warnings_of(learning), *warnings)]
+    lines = [f"warning: {w}" for w in (*(n.text for n in in_order(warnings_of(learning))), *warnings)]
     lines += [
         f"learned from {len(learning.tosses)} tosses, {learning.transitions} transitions ({learning.geometry})",
         f"size      {edges} mm (95 %: +- {half})",

@@ -87,7 +87,7 @@ def run_stage(
             "not_learned_from": list(marked),
             "without_poses": missing,
             "plane": {"offset_m": plane.offset_m, "normal": plane.normal_world.tolist(), "source": plane.source},
-            "warnings": [*warnings_of(learning), *more],
+            "warnings": [*(n.text for n in warnings_of(learning)), *more],
             "seconds": time.perf_counter() - began,
             "cpu_seconds_total": time.process_time(),
             **extra,

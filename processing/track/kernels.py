@@ -307,8 +307,9 @@ def to_object(H, g, pose, sign, H_out, g_out):
 @njit(cache=True, nogil=True)
 def inverse(pose):
     out = np.eye(4)
-    out[:3, :3] = pose[:3, :3].T
-    out[:3, 3] = -(out[:3, :3] @ np.ascontiguousarray(pose[:3, 3]))
+    back = np.ascontiguousarray(pose[:3, :3].T)
+    out[:3, :3] = back
+    out[:3, 3] = -(back @ np.ascontiguousarray(pose[:3, 3]))
     return out
 
 

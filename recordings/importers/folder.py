@@ -209,8 +209,9 @@ def _write_toss(writer: SessionWriter, toss: _Toss, layout: Layout, offset_ns: i
     first_mask = toss.folder / "mask_first.png"
     mask = read_mask(first_mask, layout.color.width, layout.color.height) if first_mask.exists() else None
     if mask is not None and not mask.any():
-        warnings.add(f"{toss.folder.name}: mask_first.png is empty, so it was left out")
-        mask = None
+        empty = "mask_first.png is empty, so it was left out"
+        warnings.add(f"{toss.folder.name}: {empty}")
+        mask, info = None, {**info, "warnings": [empty]}
     with writer.toss(toss.number, info) as t:
         if mask is not None:
             t.mask(0, mask)

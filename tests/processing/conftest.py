@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -12,7 +12,7 @@ import pytest
 
 from processing.segment.static_scene import SceneSettings, StaticScene, calibrated_table_depth, learn_scene
 from recordings.geometry import CameraModel, Transform, rotation_exp
-from recordings.records import DepthImage, EncodedImage, RgbdFrame, StampedPose
+from recordings.records import ArmStates, DepthImage, EncodedImage, RgbdFrame, StampedPose
 from recordings.session_writer import SessionWriter, write_truth
 from recordings.tracks import RigCalibration
 
@@ -86,19 +86,26 @@ class TinyWorld:
         first_mask: bool = True,
         others: Sequence[int] = (),
         gone: Callable[[int, int], bool] = lambda toss, frame: False,
+        seen_again: Callable[[list[RgbdFrame]], list[RgbdFrame]] = lambda frames: frames,
+        arm: ArmStates | None = None,
     ) -> Path:
-        """A session of these tosses on disk. In `others` another object is thrown; `gone(toss, frame)`: unseen."""
+        """A session of these tosses on disk. In `others` another object is thrown; `gone(toss, frame)`: unseen;
+        `seen_again`: what the camera makes of the frames of a toss."""
         with SessionWriter(folder, {"name": folder.name, "object": {"name": "box"}}, self.calibration) as session:
             for toss in tosses:
                 with session.toss(toss) as writer:
-                    for i, pose in enumerate(self.poses(frames, toss)):
-                        look = {"box_m": OTHER_M, "faces_rgb": 255 - FACES_RGB[::-1]} if toss in others else {}
-                        frame, mask = self.see(None if gone(toss, i) else pose, i, **look)
-                        writer.color(self._encoded(frame))
+                    look = {"box_m": OTHER_M, "faces_rgb": 255 - FACES_RGB[::-1]} if toss in others else {}
+                    poses = enumerate(self.poses(frames, toss))
+                    seen = [self.see(None if gone(toss, i) else pose, i, **look) for i, pose in poses]
+                    if arm is not None:
+                        writer.arm(arm)
+                    if first_mask and seen[0][1].any():
+                        writer.mask(0, seen[0][1])
+                    for i, frame in enumerate(seen_again([f for f, _ in seen])):
+                        at = replace(frame, index=i, time_ns=i * FRAME_NS, depth_time_ns=i * FRAME_NS)
+                        writer.color(self._encoded(at))
                         raw = np.round(frame.depth_m * 1000).astype(np.uint16)
-                        writer.depth(DepthImage("d455", i, frame.time_ns, frame.time_ns, 0.001, raw))
-                        if i == 0 and first_mask and mask.any():
-                            writer.mask(0, mask)
+                        writer.depth(DepthImage("d455", i, at.time_ns, at.time_ns, 0.001, raw))
             session.finish("complete")
         return folder
 

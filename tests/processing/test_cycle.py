@@ -24,6 +24,7 @@ from processing.reprojected import RedrawConfig, SecondFrames, redraw
 from processing.table import said
 from processing.variants import TRACKERS, find_variant
 from recordings.geometry import rotation_exp
+from recordings.notices import Notice
 from recordings.progress import Silent
 from recordings.results import Results
 from recordings.session import Session
@@ -257,7 +258,7 @@ def test_rows_share_their_stages(whole_table: Results) -> None:
 
 def test_what_contact_could_not_learn_is_said_and_the_rest_is_delivered(ours: Results) -> None:
     warnings = ours.find("ours", "all").warnings
-    assert any("contact learning was kept out" in w for w in warnings)
+    assert any("contact learning was kept out" in w.text for w in warnings)
     assert len(ours.shape("ours", "all").faces) > 100
     page = (ours.path / "report.html").read_text()
     assert page.index("kept out") < page.index("<h2>Scores")
@@ -271,9 +272,10 @@ def test_the_second_pass_says_what_it_changed(ours: Results) -> None:
 
 
 def test_what_is_said_of_several_rows_is_said_once() -> None:
+    lost, bare = Notice("s", "high", "toss 2 is lost").to_json(), Notice("s", "low", "no rollouts").to_json()
     rows: list[dict[str, Any]] = [
-        {"variant": "ours", "scope": "all", "warnings": ["toss 2 is lost"], "notes": ["tracker: x"]},
-        {"variant": "no-icp", "scope": "all", "warnings": ["toss 2 is lost", "no rollouts"], "notes": ["tracker: x"]},
+        {"variant": "ours", "scope": "all", "warnings": [lost], "notes": ["tracker: x"]},
+        {"variant": "no-icp", "scope": "all", "warnings": [bare, lost], "notes": ["tracker: x"]},
         {"variant": "ours", "scope": "one", "warnings": [], "notes": ["tracker: x"]},
     ]
     assert said(rows, "warnings") == ["ours (all), no-icp (all): toss 2 is lost", "no-icp (all): no rollouts"]

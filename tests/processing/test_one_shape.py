@@ -96,4 +96,4 @@ def test_the_others_are_joined_anew_without_a_toss_that_is_kept_apart(
     assert {d.key for d in found.shapes.values()} == {"all tosses [0, 2]"}
     assert list(found.masks) == [0, 2]
     assert not found.shared_frame
-    assert [w.split(":")[0] for w in found.warnings] == ["toss 1", "tosses [1]"]
+    assert [w.text.split(":")[0] for w in found.warnings] == ["toss 1", "tosses [1]"]

@@ -7,6 +7,7 @@ import json
 import os
 import subprocess
 import sys
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 
@@ -78,6 +79,29 @@ def test_with_json_what_libraries_print_goes_to_stderr(run, capfd):
     assert json.loads(out) == {"a": 1}
     assert "python chatter" in err
     assert "c chatter" in err
+
+
+def test_what_libraries_warn_of_does_not_reach_a_user(run, capsys):
+    def work(args: argparse.Namespace) -> Outcome:
+        warnings.warn("'@' is faster on contiguous arrays", RuntimeWarning, stacklevel=1)
+        return Outcome({}, "done")
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("always")
+        assert run(work) == 0
+        assert capsys.readouterr().err == ""
+        with pytest.warns(RuntimeWarning):  # elsewhere they are as they were
+            work(argparse.Namespace())
+
+
+def test_python_s_own_options_bring_libraries_warnings_back():
+    code = (
+        "import warnings; from recordings.console import without_library_warnings as quiet\n"
+        "with quiet(): warnings.warn('said')"
+    )
+    for options, said in (([], False), (["-W", "default"], True)):
+        done = subprocess.run([sys.executable, *options, "-c", code], capture_output=True, text=True, check=True)
+        assert ("said" in done.stderr) is said
 
 
 def test_without_json_the_text_is_printed(run, capsys):

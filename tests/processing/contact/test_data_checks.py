@@ -130,6 +130,26 @@ def test_a_plane_8_mm_off_is_refused(offset, side):
     assert checks.check_plane({0: 0.004}, "the prior shape") == 0.004
 
 
+def test_a_plane_is_blamed_first_only_where_every_toss_says_the_same():
+    told = []
+    for heights_m in ({0: 0.008, 1: 0.0078, 2: 0.0081}, {0: 0.008, 1: 0.0005, 2: 0.02}, {0: 0.008}):
+        with pytest.raises(BadInput) as refused:
+            checks.check_plane(heights_m, "the prior shape")
+        told.append(str(refused.value))
+    same, scattered, one = told
+    assert same.index("the plane (`toss-calibrate table") < same.index("the poses at rest")
+    assert scattered.index("the poses at rest") < scattered.index("the plane (`toss-calibrate table")
+    assert "One toss cannot tell" in one
+
+
+def test_own_tracks_are_never_asked_to_be_imported_in_another_reading(real_tosses):
+    tracks = [replace(t, rotation=np.swapaxes(t.rotation, 1, 2).copy()) for t in real_tosses(range(8))]
+    with pytest.raises(checks.OtherReading, match="import the data again") as refused:
+        checks.check_orientations(tracks, np.eye(3))
+    assert "import" not in refused.value.of_own_tracks
+    assert refused.value.of_own_tracks.index("its orientation is off") < refused.value.of_own_tracks.index("the table")
+
+
 def test_duplicates_are_found_and_refused_across_the_split(simulated_tosses):
     tracks = simulated_tosses(3)
     turn = Rotation.from_rotvec([0, 0, 0.7]).as_matrix()

@@ -6,6 +6,7 @@ import pytest
 import trimesh
 
 from processing.contact.choice import choose_geometry, measured_prior
+from processing.contact.data_checks import OtherReading
 from processing.contact.evaluate import world_poses
 from processing.contact.figure4 import learn_figure_4
 from processing.contact.fit import FitConfig
@@ -104,7 +105,7 @@ def test_one_toss_alone_is_enough(simulated_tosses):
     assert found.model.friction_low <= 0.25 <= found.model.friction_high
     before, after = (box_distance_m(s.vertices_m).mean() for s in (shape, found.shape))
     assert after < before + 1e-4
-    assert any("one toss only" in w for w in found.document["warnings"])
+    assert any("from one toss only" in w["seen"] for w in found.document["warnings"])
 
 
 def test_a_track_that_is_lost_for_most_of_a_toss_is_left_out_and_counted(simulated_tosses):
@@ -127,6 +128,16 @@ def test_other_object_frames_and_cameras_are_refused(simulated_tosses):
     turned = Transform("world", "mono0", WORLD_FROM_CAMERA.rotation, WORLD_FROM_CAMERA.translation_m)
     with pytest.raises(BadInput, match="wanted world_from_camera"):
         learn_from_tracks(tracks, noisy_box(), turned, config=QUICK)
+
+
+def test_tracks_whose_impacts_fit_another_reading_are_said_to_be_off(simulated_tosses, monkeypatch):
+    def refused(*_):
+        raise OtherReading(0.45, 0.1, "quaternions stored as x y z w")
+
+    monkeypatch.setattr("processing.contact.data_checks.check_orientations", refused)
+    with pytest.raises(BadInput, match="most likely its orientation is off") as wrong:
+        learn_from_tracks(tracks_of(simulated_tosses(2, 130)), noisy_box(), WORLD_FROM_CAMERA, config=QUICK)
+    assert "import" not in str(wrong.value)
 
 
 def test_a_plane_that_contradicts_what_the_camera_saw_is_refused(simulated_tosses):

@@ -198,7 +198,7 @@ def test_a_toss_whose_masks_hold_no_depth_is_lost_and_one_clear_error_where_all_
     masks = {0: done({"with_depth": True}), 1: done({"with_depth": False}), 2: done({"not_found": True})}
     kept = without_lost(run, masks)
     assert (kept.tosses, kept.lost, kept.recorded) == ((0,), (1, 2), (0, 1, 2))
-    assert "toss 1: the object's masks hold no depth: lost" in kept.warnings[0]
+    assert "toss 1: the object's masks hold no depth: lost" in kept.warnings[0].text
     with pytest.raises(BadInput, match="no toss can be tracked.*toss 1: .*no depth"):
         without_lost(replace(run, tosses=(1, 2)), masks)
 
