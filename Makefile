@@ -1,7 +1,8 @@
-# `make demo` and `make test` on a fresh clone are enough: both make .venv first.
-PYTHON := $(shell for p in python3.11 python3.12; do $$p -c 'import venv, ensurepip' 2>/dev/null && echo $$p && break; done)
+# `make demo` and `make test` on a fresh clone are enough: both make .venv first, the demo only what the commands need.
+PYTHON := $(shell for p in python3.11 python3.12 python3.13; do $$p -c 'import venv, ensurepip' 2>/dev/null && echo $$p && break; done)
 BIN := .venv/bin
 STAMP := .venv/.installed
+BASE := .venv/.installed-base
 OUT := out/demo
 SAMPLE := recordings/samples/box_toss
 EXTRAS := dev,sim,learned,rig-realsense,rig-franka,rig-ur
@@ -10,21 +11,27 @@ EXTRAS := dev,sim,learned,rig-realsense,rig-franka,rig-ur
 
 setup: $(STAMP)
 
-$(STAMP): pyproject.toml constraints.txt
-	@test -n "$(PYTHON)" || { echo "no Python 3.11 or 3.12 with venv found; wanted: apt-get install -y python3.11-venv" >&2; exit 1; }
-	$(PYTHON) tools/check_system.py
+$(BASE): pyproject.toml constraints.txt
+	@test -n "$(PYTHON)" || { echo "no Python 3.11, 3.12 or 3.13 with venv found; as root, type: apt-get update && apt-get install -y python3-venv" >&2; exit 1; }
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
+	$(BIN)/python tools/check_system.py --for demo --bring .venv
 	# torch first and pinned: otherwise another package pulls the newest CUDA build, several gigabytes
 	$(BIN)/python -m pip install -q torch==2.13.0 -c constraints.txt
-	$(BIN)/python -m pip install -q -e ".[$(EXTRAS)]" -c constraints.txt
-	touch $(STAMP)
+	$(BIN)/python -m pip install -q -e . -c constraints.txt
+	touch $@
 
-demo: $(STAMP)
+$(STAMP): $(BASE)
+	$(BIN)/python tools/check_system.py --for test --bring .venv
+	$(BIN)/python -m pip install -q -e ".[$(EXTRAS)]" -c constraints.txt
+	touch $@
+
+demo: $(BASE)
 	$(BIN)/toss-session info $(SAMPLE)
 	$(BIN)/toss-process $(SAMPLE) --out $(OUT)/results
 	rm -f $(OUT)/result.rrd $(OUT)/result.png  # toss-view overwrites nothing; these are this target's own
 	$(BIN)/toss-view $(OUT)/results --save $(OUT)/result.rrd
 	$(BIN)/toss-view $(OUT)/results --screenshot $(OUT)/result.png
+	$(BIN)/python tools/judge_demo.py $(OUT)/results
 	@echo "look at $(OUT)/result.png and $(OUT)/results/report.html, open $(OUT)/result.rrd: $(BIN)/toss-view $(OUT)/results"
 
 test: $(STAMP)

@@ -13,6 +13,7 @@ from acquisition.drivers import usb
 from acquisition.preflight import Preflight, Row
 from acquisition.streams import READS
 from recordings.errors import DeviceNotFound
+from recordings.system_libraries import advice
 
 USBFS = Path("/sys/module/usbcore/parameters/usbfs_memory_mb")
 USBFS_MB = 1000
@@ -47,8 +48,11 @@ def realsense() -> Iterator[Row]:
 
     try:
         found = connected()
-    except DeviceNotFound:
-        return  # `packages` has said so
+    except DeviceNotFound as missing:
+        library = advice(missing.__cause__) if isinstance(missing.__cause__, ImportError) else None
+        if library:  # a package that is not there at all has been said by `packages`
+            yield Row("package", "pyrealsense2", "warning", "cannot be loaded", library)
+        return
     for text in found:
         yield Row("camera", "realsense", "ok", text)
     if not found:

@@ -28,6 +28,7 @@ from typing import Any, NoReturn
 
 from recordings.errors import TosslabError
 from recordings.progress import Console, Log, Progress
+from recordings.system_libraries import advice
 
 DONE, FELL_SHORT, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 
@@ -59,9 +60,21 @@ class Parser(argparse.ArgumentParser):
         raise Usage(f"{message}; see `{self.prog} --help`", self.format_usage())
 
 
+class VersionAsked(Exception):
+    """`--version` was among the arguments."""
+
+
+class _Version(argparse.Action):
+    def __call__(self, *_: object) -> NoReturn:
+        raise VersionAsked
+
+
 def command_parser(prog: str, description: str, *examples: str) -> Parser:
-    """A parser with `--json`; `examples` are shown at the end of `--help`, each ready to be copied."""
+    """A parser with `--json` and `--version`; `examples` are shown at the end of `--help`, each ready to be copied."""
     parser = Parser(prog=prog, **help_texts(description, *examples))
+    parser.add_argument(
+        "--version", action=_Version, nargs=0, help="print the version of tosslab and of what it runs on"
+    )
     add_json(parser)
     return parser
 
@@ -103,6 +116,8 @@ def run_command(parser: Parser, argv: Sequence[str] | None = None) -> int:
     except Usage as wrong:
         print(wrong.usage, end="", file=sys.stderr)
         return _print(_failed(str(wrong), parser.prog, wrong), as_json)
+    except VersionAsked:
+        return _print(_versions(parser.prog), as_json)
     except SystemExit as ended:  # --help
         return int(ended.code or 0)
     work: Work | None = getattr(args, "work", None)
@@ -115,6 +130,14 @@ def run_command(parser: Parser, argv: Sequence[str] | None = None) -> int:
 
 
 _log = Log()
+
+
+def _versions(prog: str) -> Outcome:
+    from recordings.version import versions
+
+    found = versions()
+    others = ", ".join(f"{name} {value}" for name, value in found.items() if name not in ("tosslab", "commit"))
+    return Outcome(found, f"{prog} {found['tosslab']} (commit {found['commit']}; {others})")
 
 
 def progress_for(label: str) -> Progress:
@@ -148,6 +171,8 @@ def _guarded(work: Work, args: argparse.Namespace, prog: str) -> Outcome:
         name = f"{error.filename}: " if error.filename else ""
         return _failed(f"{name}{error.strerror or error}", prog, error)
     except Exception as error:
+        if isinstance(error, ImportError) and (missing := advice(error)):
+            return _failed(missing, prog, error)
         traceback.print_exc(file=sys.stderr)
         fault = "a fault of tosslab, not of your input: please report the lines above"
         return _failed(f"{type(error).__name__}: {error}; {fault}", prog, error)

@@ -10,6 +10,9 @@ import tomllib
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
+from packaging.specifiers import SpecifierSet
+from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).resolve().parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -81,6 +84,29 @@ def test_every_package_that_the_project_asks_for_is_pinned():
     asked = [*PROJECT["dependencies"], *(n for extra in PROJECT["optional-dependencies"].values() for n in extra)]
     pinned = {plain(line) for line in (ROOT / "constraints.txt").read_text().splitlines()}
     assert {plain(name) for name in asked} <= pinned
+
+
+def test_every_pin_lies_in_the_range_that_the_project_asks_for():
+    asked = [Requirement(n) for n in PROJECT["dependencies"]]
+    asked += [Requirement(n) for extra in PROJECT["optional-dependencies"].values() for n in extra]
+    pins = (line.split("==") for line in (ROOT / "constraints.txt").read_text().splitlines())
+    pinned = {canonicalize_name(name): version for name, version in pins}
+    wrong = [str(r) for r in asked if not r.specifier.contains(pinned[canonicalize_name(r.name)], prereleases=True)]
+    assert not wrong
+
+
+def test_the_same_pythons_are_named_by_the_project_the_makefile_and_the_readme():
+    allowed = SpecifierSet(PROJECT["requires-python"])
+    wanted = [f"3.{minor}" for minor in range(8, 20) if f"3.{minor}.1" in allowed]
+    made = re.findall(r"python(3\.\d+)", re.search(r"^PYTHON := .*$", (ROOT / "Makefile").read_text(), re.M).group())
+    said = re.findall(r"3\.\d+", re.search(r"Python 3[^;:]*", (ROOT / "README.md").read_text()).group())
+    assert made == wanted
+    assert said == wanted
+
+
+def test_torch_is_installed_first_in_the_version_that_is_pinned():
+    assert "torch==2.13.0" in PROJECT["dependencies"]
+    assert re.findall(r"torch==[\d.]+", (ROOT / "Makefile").read_text()) == ["torch==2.13.0"]
 
 
 @pytest.fixture
