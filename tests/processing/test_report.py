@@ -56,8 +56,8 @@ def made(tiny_world, record_tiny, tmp_path):
         write_shape(stage, shape)
         (stage / "stage.json").write_text(json.dumps({"key": "k"}))
     tosses = tuple(TossRecord(t, f"track-{t}", "track-0", f"track-{t}") for t in (0, 1))
-    write_variant(out, VariantRecord("ours", "all", "ours <more>", "tiny", "box", session.calibration, tosses, shape="track-0",
-                                     shared_object_frame=True))  # fmt: skip
+    words = ("ours", "all", "ours <more>", "tiny", "box")
+    write_variant(out, VariantRecord(*words, session.calibration, tosses, "track-0", shared_object_frame=True))
     results = Results.open(out)
     yield results, Row(results.find(), results.tracks(), _score(results)), session
     session.close()
