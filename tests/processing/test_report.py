@@ -56,8 +56,8 @@ def made(tiny_world, record_tiny, tmp_path):
         write_shape(stage, shape)
         (stage / "stage.json").write_text(json.dumps({"key": "k"}))
     tosses = tuple(TossRecord(t, f"track-{t}", "track-0", f"track-{t}") for t in (0, 1))
-    write_variant(out, VariantRecord("ours", "all", "ours", "tiny", "box", session.calibration, tosses, shape="track-0",
-                                     shared_object_frame=True, warnings=("what <is> said",)))  # fmt: skip
+    words = ("ours", "all", "ours <more>", "tiny", "box")
+    write_variant(out, VariantRecord(*words, session.calibration, tosses, "track-0", shared_object_frame=True))
     results = Results.open(out)
     yield results, Row(results.find(), results.tracks(), _score(results)), session
     session.close()
@@ -89,7 +89,8 @@ def test_the_page_loads_nothing_from_anywhere_and_escapes_what_others_wrote(made
     sources = re.findall(r"(?:src|href)\s*=\s*['\"]?([^'\" >]{0,20})", page)
     assert sources
     assert all(s.startswith("data:image/") for s in sources)
-    assert "what &lt;is&gt; said" in page
+    assert "ours &lt;more&gt;" in page
+    assert "<more>" not in page
     assert len(page) < 3_000_000
 
 
