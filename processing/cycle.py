@@ -238,7 +238,7 @@ def _said(told: Mapping[str, Any], config: CycleConfig) -> tuple[str, ...]:
     if told["same"]:
         return (f"{told['of']}: the second pass was kept: it only repeats the first one",)
     if told["worse_share"] > 0:
-        limit = f"up to {100 * config.much_worse:.0f} % is chance"
+        limit = f"beyond {100 * config.much_worse:.0f} % it is left out"
         return (f"{told['of']}: the second pass was kept: it explains the raw images as well as the first "
                 f"({_percent(told)} worse; {limit})",)  # fmt: skip
     return (f"{told['of']}: the second pass was kept: it explains the raw images better ({_percent(told)})",)
