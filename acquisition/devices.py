@@ -277,6 +277,9 @@ class Arm(Device, Protocol):
         """Begin to follow it; returns at once. Raises DeviceRefused when the arm is not ready, does not stand at the
         trajectory's start, or is moving."""
 
+    def may_move(self) -> None:
+        """Raises DeviceRefused, saying what to do, where the arm or this computer is not fit for a motion now."""
+
     def motion(self) -> Motion: ...
 
     def halt(self) -> None:
@@ -284,6 +287,14 @@ class Arm(Device, Protocol):
 
     def recover(self) -> None:
         """Leave a reflex. Raises DeviceRefused while the user stop is pressed."""
+
+
+@runtime_checkable
+class TakesLoad(Protocol):
+    """An arm that is told what its hand holds. Others are told at their panel."""
+
+    def set_load(self, mass_kg: float, centre_flange_m: Float[Array, "3"], radius_m: float) -> None:
+        """A full ball of this mass about a point in the flange's frame; mass 0: nothing. Not during a motion."""
 
 
 @runtime_checkable

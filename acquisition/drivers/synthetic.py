@@ -460,6 +460,9 @@ class _ArmBody:
         assert self._trajectory is not None
         return time.monotonic_ns() > self._started_ns + self._trajectory.duration_s * 1e9
 
+    def may_move(self) -> None:
+        pass
+
     def motion(self) -> Motion:
         with self._lock:
             if self._trajectory is None:
