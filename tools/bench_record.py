@@ -54,6 +54,7 @@ from acquisition.toss import (  # noqa: E402
 )
 from acquisition.toss_limits import arm_model  # noqa: E402
 from acquisition.verdict import Verdict  # noqa: E402
+from acquisition.workspace import Space  # noqa: E402
 from recordings.geometry import Transform, rotation_exp  # noqa: E402
 from recordings.progress import Silent  # noqa: E402
 from recordings.session import Session  # noqa: E402

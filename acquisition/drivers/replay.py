@@ -307,7 +307,7 @@ class ReplayArm(_Replayed):
         raise DeviceRefused(f"{self.name} is a recording: it does not move")
 
     def may_move(self) -> None:
-        pass
+        raise DeviceRefused(f"{self.name} is a recording: it does not move")
 
     def motion(self) -> Motion:
         return Motion("none")

@@ -460,9 +460,6 @@ class _ArmBody:
         assert self._trajectory is not None
         return time.monotonic_ns() > self._started_ns + self._trajectory.duration_s * 1e9
 
-    def may_move(self) -> None:
-        pass
-
     def motion(self) -> Motion:
         with self._lock:
             if self._trajectory is None:
@@ -578,6 +575,9 @@ class SyntheticArm(_Device):
         if self._mode() in ("reflex", "user_stopped"):
             raise DeviceRefused(f"{self.name} stands in {self._mode()}; release the stop, then recover")
         self._lab.arm.move(trajectory)
+
+    def may_move(self) -> None:
+        """A simulated arm hurts nobody."""
 
     def motion(self) -> Motion:
         return self._lab.arm.motion()
