@@ -154,8 +154,8 @@ class ArmThrower:
         """Delays of so many openings of the empty hand; a key ends them, and they are asked for anew."""
         c = self._config
         said = (
-            f"the hand will close with {c.grasp_force_n:g} N and open to {1e3 * c.open_width_m:.0f} mm {openings} times "
-            "to measure its delay: keep it empty, keep clear of it; any key stops it"
+            f"the hand will close with {c.grasp_force_n:g} N and open to {1e3 * c.open_width_m:.0f} mm {openings} "
+            "times to measure its delay: keep it empty, keep clear of it; any key stops it"
         )
         while True:
             ask(self._operator, said, self._countdown_s)

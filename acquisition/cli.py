@@ -33,7 +33,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--resume", action="store_true", help="go on with the session in OUT")
     parser.add_argument("--yes", action="store_true", help="ask nobody (a real arm: only with `unattended = true`)")
     parser.add_argument(
-        "--speed", type=float, default=1.0, metavar="F", help="a real arm moves and tosses at F times its speed (0 to 1)"
+        "--speed",
+        type=float,
+        default=1.0,
+        metavar="F",
+        help="a real arm moves and tosses at F times its speed (0 to 1)",
     )
     parser.add_argument("--preview", action="store_true", help="show the devices live in rerun")
     parser.add_argument("--dry-run", action="store_true", help="plan and check the tosses; nothing moves or is written")

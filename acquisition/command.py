@@ -138,7 +138,9 @@ def at_speed(setup: Setup, speed: float) -> Setup:
     if speed == 1:
         return setup
     if not setup.moves_arm:
-        raise BadInput(f"--speed {speed:g} slows a real arm that tosses; rig '{setup.rig.name}' moves none: leave it out")
+        raise BadInput(
+            f"--speed {speed:g} slows a real arm that tosses; rig '{setup.rig.name}' moves none: leave it out"
+        )
     config = replace(setup.rig.recording, longest_toss_s=setup.rig.recording.longest_toss_s / speed)
     return replace(setup, rig=replace(setup.rig, recording=config))
 

@@ -139,8 +139,10 @@ def plan_toss(model: ArmModel, space: Space, target: TossTarget, delay: ReleaseD
     best: Breach | Contact | None = None
     for q, dq in _releases(model, base_from_tool, twist):
         breach: Breach | Contact | None = _speed_breach(model, dq)
-        for run_up_s in RUN_UPS_S if breach is None else ():
-            plan, breach = _attempt(model, q, dq, run_up_s, delay, space)
+        run_ups_s = RUN_UPS_S if breach is None else ()
+        for run_up_s in run_ups_s:
+            plan, wrong = _attempt(model, q, dq, run_up_s, delay, space)
+            breach = breach or wrong
             if plan is not None:
                 trajectory, release_s, window_s = plan
                 return TossPlan(

@@ -84,7 +84,7 @@ class Space:
                 "[workspace]              # metres, in the world (on the table, z up)\n"
                 "lower_m = [x, y, z]      # no part of the arm leaves this box\n"
                 "upper_m = [x, y, z]\n"
-                "posts = [{ name = '...', from_m = [x, y, z], to_m = [x, y, z], radius_m = r }]   # [] where there are none"
+                "posts = [{ name = '...', from_m = [x, y, z], to_m = [x, y, z], radius_m = r }]   # [] for none"
             )
         if not all(low < high for low, high in zip(given.lower_m, given.upper_m)):
             raise BadInput(f"{rig.source}: [workspace] lower_m {given.lower_m} is not below upper_m {given.upper_m}")

@@ -71,8 +71,8 @@ class FrankaArm(WorkerArm):
         if self._realtime == "ignore" or realtime_kernel():
             return ""
         return (
-            f"this computer's kernel ({os.uname().release}) is not real-time, so that 1 kHz cycles may be missed and the "
-            "arm may jerk and stop; nothing was moved. Boot one (apt-get install linux-image-rt-amd64, then see "
+            f"this computer's kernel ({os.uname().release}) is not real-time, so that 1 kHz cycles may be missed and "
+            "the arm may jerk and stop; nothing was moved. Boot one (apt-get install linux-image-rt-amd64, then see "
             '`toss-record --doctor`), or take that on you: settings = { realtime = "ignore" } in the rig file'
         )
 

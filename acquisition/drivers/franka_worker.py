@@ -175,9 +175,7 @@ def guard(robot: Any, torque_nm: float, force_n: float) -> None:
     """Where the arm stops by itself: this much while it speeds up or brakes, half at constant speed; no load yet."""
     torque, force = [torque_nm] * JOINTS, [force_n] * 6
     half_torque, half_force = [torque_nm / 2] * JOINTS, [force_n / 2] * 6
-    robot.set_collision_behavior(
-        torque, torque, half_torque, half_torque, force, force, half_force, half_force
-    )
+    robot.set_collision_behavior(torque, torque, half_torque, half_torque, force, force, half_force, half_force)
     robot.set_load(0.0, [0.0] * 3, [0.0] * 9)
 
 

@@ -192,7 +192,7 @@ def test_the_arm_says_what_it_will_do_and_waits_for_a_key_and_counts_down() -> N
 
 def test_quitting_instead_moves_nothing() -> None:
     person = Person(starts=0)
-    made, recorder = thrower(person)
+    made, _ = thrower(person)
     with pytest.raises(KeyboardInterrupt):
         made.prepare(0, 0, Silent())
     with pytest.raises(KeyboardInterrupt):
@@ -212,10 +212,9 @@ def test_a_key_in_the_countdown_stops_it_and_asks_anew() -> None:
 
 
 def test_a_key_halts_the_arm_on_its_way_and_the_rest_is_asked_for_anew() -> None:
-    person = Person(presses_after_s=1.3)
+    person = Person(starts=1, presses_after_s=1.3)
     made, recorder = thrower(person, fast=1.0)
     with pytest.raises(KeyboardInterrupt):
-        person._starts = 1
         made.prepare(0, 0, Silent())
     assert person.log.count("MOVE") == 1
     assert person.log.index("MOVE") < person.log.index("HALT")

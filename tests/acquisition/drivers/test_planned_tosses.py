@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -180,7 +181,8 @@ def test_toss_record_tosses_with_a_panda(
     monkeypatch.setattr(preflight, "RATE_BAD", 0.9)  # on a busy machine the simulator's seconds are longer than ours
     rig, out = tmp_path / "panda.toml", tmp_path / "out"
     rig.write_text(PANDA_RIG.replace("ADDRESS", fci[0]))
-    RigCalibration(cameras={}, transforms=(BASE,)).write(tmp_path / "calibration.json")
+    placed = RigCalibration(cameras={}, transforms=(BASE,))
+    (tmp_path / "calibration.json").write_text(json.dumps(placed.to_json()))
     assert main(["--rig", str(rig), "--yes", str(out)]) == 0
     with Session.open(out) as session:
         delay = session.start["release_delay"]

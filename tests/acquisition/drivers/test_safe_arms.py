@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -49,7 +51,9 @@ def test_a_panda_is_told_its_thresholds_and_its_load(fci: tuple[str, Apart]) -> 
         arm.set_load(0.4, np.array([0.0, 0.01, 0.11]), 0.05)
         mass, x, y, z, *inertia = simulator.snapshot()["set_load"]
         assert (mass, x, y, z) == (0.4, 0.0, 0.01, 0.11)
-        np.testing.assert_allclose(np.reshape(inertia, (3, 3)), 0.4 * 0.4 * 0.05**2 * np.eye(3))  # a full ball: 2/5 m r2
+        np.testing.assert_allclose(
+            np.reshape(inertia, (3, 3)), 0.4 * 0.4 * 0.05**2 * np.eye(3)
+        )  # a full ball: 2/5 m r2
     with pytest.raises(DeviceRefused, match="wanted more than 0, at most 87 Nm"):
         FrankaArm(host=address, collision_torque_nm=500.0)
 
@@ -79,11 +83,16 @@ def test_a_reflex_on_the_way_ends_the_session_and_nothing_recovers_it(fci: tuple
     arm = FrankaArm(host=address, realtime="ignore")
     recorder = Recorder(Rig("t", (entry,), Path("t.toml"), "panda"), {"arm": arm}, SessionClock(time.monotonic_ns(), 0))
     toss = TossConfig(position_m=(0.45, 0.0, 0.4), velocity_m_s=(0.2, 0.0, 0.2), velocity_spread_m_s=0.0)
+
+    class Troubles(Nobody):
+        def wait_for_start(self) -> Any:
+            simulator.inject("reflex", at_s=1.0, error="cartesian_reflex")
+            return "start"
+
     with recorder:
         time.sleep(0.5)
         before = simulator.snapshot()
-        simulator.inject("reflex", at_s=1.0, error="cartesian_reflex")
-        thrower = ArmThrower(arm_model("panda"), SPACE, toss, recorder, Nobody(), countdown_s=0.0)
+        thrower = ArmThrower(arm_model("panda"), SPACE, toss, recorder, Troubles(), speed=0.1, countdown_s=0.0)
         with pytest.raises(TosslabError, match="cartesian_reflex; nothing is recovered or tried again by itself"):
             thrower.prepare(0, 0, Silent())
         time.sleep(0.5)
@@ -97,7 +106,10 @@ def test_a_reflex_on_the_way_ends_the_session_and_nothing_recovers_it(fci: tuple
 
 @pytest.mark.parametrize(
     "fault, says",
-    [("local_control", "it is in local control; nothing was moved"), ("reduced", "its safety mode is REDUCED, wanted NORMAL")],
+    [
+        ("local_control", "it is in local control; nothing was moved"),
+        ("reduced", "its safety mode is REDUCED, wanted NORMAL"),
+    ],
 )
 def test_a_ur_is_asked_for_safety_mode_and_remote_control_before_it_moves(
     fault: str, says: str, rtde: tuple[str, Apart]
@@ -142,10 +154,13 @@ def test_toss_record_moves_no_panda_for_yes_alone_nor_by_a_place_that_was_made_u
     before = fci[1].snapshot()
     rig, out = tmp_path / "rig.toml", tmp_path / "out"
     rig.write_text(RIG.replace("ADDRESS", fci[0]))
-    RigCalibration(cameras={}, transforms=(SPACE.world_from_base,)).write(tmp_path / "calibration.json")
+    placed = RigCalibration(cameras={}, transforms=(SPACE.world_from_base,))
+    (tmp_path / "calibration.json").write_text(json.dumps(placed.to_json()))
     assert main(["--rig", str(rig), "--yes", str(out)]) == 2
     assert "--yes would move a real arm without asking" in capsys.readouterr().err
-    made_up = RIG.replace('calibration = "calibration.json"\n', "").replace("[toss]", "[toss]\nworld_from_base = [0, 0, 0, 0]")
+    made_up = RIG.replace('calibration = "calibration.json"\n', "").replace(
+        "[toss]", "[toss]\nworld_from_base = [0, 0, 0, 0]"
+    )
     rig.write_text(made_up.replace("ADDRESS", fci[0]))
     assert main(["--rig", str(rig), str(out)]) == 2
     assert "the arm is not calibrated: nothing was moved" in capsys.readouterr().err
