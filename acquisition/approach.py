@@ -46,7 +46,7 @@ class Approach:
         round_about = f", by {self.stops} poses round what stands between" if self.stops else ""
         return (
             f"joints from {_degrees(q[0])} to {_degrees(q[-1])} deg{round_about}; the tool goes "
-            f"{100 * self.tool_way_m:.0f} cm, no part faster than {self.fastest_m_s:.2f} m/s, "
+            f"{100 * self.tool_way_m:.0f} cm, no part faster than {self.fastest_m_s:.3f} m/s, "
             f"in {self.trajectory.duration_s:.1f} s"
         )
 
@@ -87,12 +87,12 @@ def find_way(model: ArmModel, space: Space, from_rad: Pose, to_rad: Pose) -> lis
         way = [from_rad, *between, to_rad]
         if all(_clear(model, space, a, b) for a, b in zip(way, way[1:])):
             return way
-    way = _sampled(model, space, from_rad, to_rad)
-    if way is None:
+    found = _sampled(model, space, from_rad, to_rad)
+    if found is None:
         raise PathRefused(
             f"the way to the start is refused: {direct}; no way round it was found; move the arm by hand first"
         )
-    return _shortened(model, space, way)
+    return _shortened(model, space, found)
 
 
 def fastest_m_s(model: ArmModel, samples: Samples) -> float:

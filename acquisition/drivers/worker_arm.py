@@ -122,8 +122,7 @@ class WorkerArm:
                 f"{self.name}: the trajectory starts {away[joint]:.3f} rad from where {self.joint_names[joint]} stands "
                 f"({q_now[joint]:.3f} rad), wanted within {START_RAD:g} rad; move to its start first"
             )
-        ticks = int(np.ceil(trajectory.duration_s * self.rate_hz)) + 1
-        path = np.stack([trajectory.at(k / self.rate_hz)[0] for k in range(ticks)])
+        path = trajectory.sampled(self.rate_hz)
         self._motion = Motion("moving", started_host_ns=time.monotonic_ns())
         worker.send({"do": "move"}, path.astype("<f8").tobytes())
 

@@ -393,3 +393,46 @@ def test_a_failing_close_says_what_it_was() -> None:
     assert [(t.device, t.kind, t.text) for t in told] == [
         ("mono0", "not put away", "close failed: ValueError: cable of smoke")
     ]
+
+
+class Pressing(Nobody):
+    """Asked at a simulated lab: says yes, decides by the verdict, presses a key when `when` says so, once."""
+
+    headless = False
+
+    def __init__(self, when: Any) -> None:
+        super().__init__()
+        self.when, self.pressed, self.asked = when, False, 0
+        self.told: list[str] = []
+
+    def say(self, text: str) -> None:
+        self.told.append(text)
+
+    def wait_for_start(self) -> Any:
+        self.asked += 1
+        return "start"
+
+    def touched(self) -> bool:
+        if not self.pressed and self.when():
+            self.pressed = True
+            return True
+        return False
+
+    def decide(self, verdict: Any) -> Any:
+        return verdict.decision
+
+
+def test_any_key_stops_a_toss_while_the_arm_moves(record: Any) -> None:
+    lab: list[Any] = []
+    operator = Pressing(lambda: lab[0].arm.motion().status == "moving")
+    done = record(lab.append, seconds=5.0, operator=operator)
+    assert done.take.ended_by == "stop key"
+    assert done.lab.arm.motion().status == "aborted"
+
+
+def test_any_key_stops_the_countdown_of_a_toss_and_it_is_asked_for_anew(record: Any) -> None:
+    operator = Pressing(lambda: True)
+    done = record(seconds=0.5, operator=operator, countdown_s=1.0)
+    assert operator.asked == 2
+    assert operator.told.index("stopped: nothing moved") < operator.told.index("1", operator.told.index("1") + 1)
+    assert done.take.ended_by == "time"

@@ -85,15 +85,19 @@ def test_a_reflex_on_the_way_ends_the_session_and_nothing_recovers_it(fci: tuple
     toss = TossConfig(position_m=(0.45, 0.0, 0.4), velocity_m_s=(0.2, 0.0, 0.2), velocity_spread_m_s=0.0)
 
     class Troubles(Nobody):
-        def wait_for_start(self) -> Any:
-            simulator.inject("reflex", at_s=1.0, error="cartesian_reflex")
-            return "start"
+        told = False
+
+        def touched(self) -> bool:
+            if arm.motion().status == "moving" and not self.told:
+                self.told = True
+                simulator.inject("reflex", at_s=2.0, error="cartesian_reflex")
+            return False
 
     with recorder:
         time.sleep(0.5)
         before = simulator.snapshot()
         thrower = ArmThrower(arm_model("panda"), SPACE, toss, recorder, Troubles(), speed=0.1, countdown_s=0.0)
-        with pytest.raises(TosslabError, match="cartesian_reflex; nothing is recovered or tried again by itself"):
+        with pytest.raises(TosslabError, match=r"cartesian_reflex.*nothing is recovered or tried again by itself"):
             thrower.prepare(0, 0, Silent())
         time.sleep(0.5)
         after = simulator.snapshot()
@@ -102,6 +106,50 @@ def test_a_reflex_on_the_way_ends_the_session_and_nothing_recovers_it(fci: tuple
         assert after["motions"] == before["motions"] + 1
         arm.recover()  # a person's word
         assert simulator.snapshot()["recoveries"] == before["recoveries"] + 1
+
+
+def test_a_panda_stands_until_a_key_and_any_key_halts_it(fci: tuple[str, Apart]) -> None:
+    address, simulator = fci
+    entry = DeviceEntry("arm", "arm", "franka", address=address, rate_hz=1000.0)
+    arm = FrankaArm(host=address, realtime="ignore")
+    recorder = Recorder(Rig("t", (entry,), Path("t.toml"), "panda"), {"arm": arm}, SessionClock(time.monotonic_ns(), 0))
+    toss = TossConfig(position_m=(0.45, 0.0, 0.4), velocity_m_s=(0.2, 0.0, 0.2), velocity_spread_m_s=0.0)
+
+    class Person(Nobody):
+        """Starts once, presses a key when the arm has moved for a second, and leaves when asked again."""
+
+        headless = False
+        asked_at: list[dict[str, Any]]
+        moving_since_s: float | None = None
+
+        def wait_for_start(self) -> Any:
+            time.sleep(0.5)
+            self.asked_at = [*getattr(self, "asked_at", []), simulator.snapshot()]
+            return "start" if len(self.asked_at) == 1 else "quit"
+
+        def touched(self) -> bool:
+            if arm.motion().status == "moving":
+                self.moving_since_s = self.moving_since_s or time.monotonic()
+                return time.monotonic() > self.moving_since_s + 1.0
+            return False
+
+    person = Person()
+    with recorder:
+        time.sleep(0.5)
+        if simulator.snapshot()["mode"] == "REFLEX":
+            arm.recover()
+        before = simulator.snapshot()
+        thrower = ArmThrower(arm_model("panda"), SPACE, toss, recorder, person, speed=0.1, countdown_s=1.0)
+        goal = thrower.plan(0).trajectory.q_rad[0]
+        with pytest.raises(KeyboardInterrupt):
+            thrower.prepare(0, 0, Silent())
+        first, second = person.asked_at
+        assert (first["motions"], first["q_d"]) == (before["motions"], before["q_d"])  # not a step before the key
+        assert second["motions"] == before["motions"] + 1
+        stands = np.array(second["q_d"])
+        assert np.abs(stands - before["q_d"]).max() > 1e-4
+        assert np.abs(stands - goal).max() > 0.01  # halted on its way
+        assert arm.motion().reason == "halted"
 
 
 @pytest.mark.parametrize(
@@ -140,6 +188,8 @@ driver = "franka"
 address = "ADDRESS"
 rate_hz = 1000
 [toss]
+position_m = [0.45, 0.0, 0.4]
+velocity_m_s = [0.2, 0.0, 0.2]
 held_mass_kg = 0.2
 [workspace]
 lower_m = [-1.0, -1.0, -0.1]
