@@ -1,3 +1,4 @@
+# long because: the plain devices and the questions that are asked of them belong on one page
 """Nothing moves unasked: said first, begun by a key, counted down, stopped by any key."""
 
 from __future__ import annotations

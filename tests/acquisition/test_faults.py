@@ -231,11 +231,10 @@ def test_a_take_that_does_not_end_says_why_while_it_runs_and_in_its_verdict(
     record: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("acquisition.run.WAITS_AFTER_S", 0.5)
-    done = record(seconds=None, longest_toss_s=3.0)  # ready-made pictures show no object
+    done = record(seconds=None, longest_toss_s=3.0)
     said = [text for text in done.operator.told if text.startswith("still recording after")]
     assert said
     assert "the arm still moves" in said[0]
-    reasons = ("the fingers were not seen to open", "the arm still moves", "the object ")
     cut = next(text for text in done.take.verdict.warnings if text.startswith("cut after 3 s"))
     assert "[recording] longest_toss_s" in cut
-    assert any(reason in cut for reason in reasons)
+    assert cut.endswith("no calibrated depth camera watches the object, so that its rest is not seen")
