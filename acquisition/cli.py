@@ -17,6 +17,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         "Record tosses into a session folder: preflight, countdown, take, verdict, one file per toss.",
         "toss-record --rig synthetic --tosses 3 --yes sessions/first",
         "toss-record --rig lab.toml --tosses 10 --object jack",
+        "toss-record --rig lab.toml --speed 0.1 sessions/rehearsal",
         "toss-record --rig lab.toml --calibration board sessions/calibration",
         "toss-record --rig replay:sessions/first --yes sessions/again",
         "toss-record --doctor",
@@ -30,7 +31,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--operator", default="", metavar="NAME", help="who records")
     parser.add_argument("--calibration", choices=("board", "hand-eye"), help="record views for calibration instead")
     parser.add_argument("--resume", action="store_true", help="go on with the session in OUT")
-    parser.add_argument("--yes", action="store_true", help="ask nobody: keep what is good, try again what is not")
+    parser.add_argument("--yes", action="store_true", help="ask nobody (a real arm: only with `unattended = true`)")
+    parser.add_argument(
+        "--speed",
+        type=float,
+        default=1.0,
+        metavar="F",
+        help="a real arm moves and tosses at F times its speed (0 to 1)",
+    )
     parser.add_argument("--preview", action="store_true", help="show the devices live in rerun")
     parser.add_argument("--dry-run", action="store_true", help="plan and check the tosses; nothing moves or is written")
     parser.add_argument("--between", action="store_true", help="keep the frames between the tosses too")

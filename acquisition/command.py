@@ -17,7 +17,7 @@ from typing import Any
 
 from acquisition.clock import SessionClock
 from acquisition.interrupts import Interrupts
-from acquisition.operator import Keyboard, Nobody, Operator, single_keys
+from acquisition.operator import Keyboard, Nobody, Operator, Unattended, single_keys
 from acquisition.preflight import Preflight, of_recording, preflight
 from acquisition.recorder import Recorder
 from acquisition.rig import Rig
@@ -43,9 +43,10 @@ def run(args: argparse.Namespace) -> Outcome:
     if args.between:
         config = replace(setup.rig.recording, between_tosses=True)
         setup = replace(setup, rig=replace(setup.rig, recording=config))
-    operator: Operator = Nobody() if args.yes else Keyboard()
+    setup = at_speed(setup, args.speed)
     if args.dry_run:
-        return _dry_run(setup, args.tosses, operator)
+        return _dry_run(setup, args.tosses, args.speed)
+    operator = the_operator(setup, args)
     out = args.out if args.out is not None else new_folder(setup.rig, args.object)
     check_folder(out, args.resume)
     check_room(out, setup.rig.recording.reserve_gb)
@@ -81,7 +82,7 @@ def _record(
             checks = of_recording(recorder, setup.calibration, out)
         operator.say(checks.text())
         _go_on(checks, operator)
-        thrower = make_thrower(setup, recorder, operator)
+        thrower = setup.thrower if args.calibration else make_thrower(setup, recorder, operator, args.speed)
         measured = {} if args.calibration else thrower.get_ready()
         start = {**start_document(args, setup, clock, recorder, checks), **measured}
         with interrupts.shield():
@@ -97,6 +98,8 @@ def _record(
             report = session_run.record(Options(args.tosses, first))
         with interrupts.shield():
             session.finish("complete" if not report.stopped else "stopped", report.stopped)
+    for trouble in recorder.troubles():
+        operator.say(f"{trouble.device}: {trouble.kind}: {trouble.text}")
     return report, checks
 
 
@@ -108,9 +111,43 @@ def _doctor(folder: Path) -> Outcome:
     return Outcome({"rows": rows}, found.text(), FELL_SHORT if found.failed else DONE)
 
 
-def _dry_run(setup: Setup, tosses: int, operator: Operator) -> Outcome:
+def the_operator(setup: Setup, args: argparse.Namespace) -> Operator:
+    """Who is asked. Raises BadInput for an arm that would move without anybody, before anything is opened."""
+    moves = setup.moves_arm and not args.calibration
+    if moves:
+        from acquisition.arm_thrower import safe_to_move
+
+        safe_to_move(setup.rig, setup.calibration)
+    if not args.yes:
+        return Keyboard()
+    if not moves:
+        return Nobody()
+    if not setup.rig.unattended:
+        raise BadInput(
+            f"{setup.rig.source}: --yes would move a real arm without asking; nothing was moved. Leave --yes out and "
+            "stay at the keys, or write `unattended = true` into the rig file where nobody can come near the arm "
+            "(docs/safety.md)"
+        )
+    return Unattended()
+
+
+def at_speed(setup: Setup, speed: float) -> Setup:
+    """The set-up for motions at `speed`: slower tosses are longer takes. Raises BadInput for a speed that is none."""
+    if not 0 < speed <= 1:
+        raise BadInput(f"--speed {speed:g}; wanted more than 0 and at most 1, e.g. --speed 0.1 for a first session")
+    if speed == 1:
+        return setup
+    if not setup.moves_arm:
+        raise BadInput(
+            f"--speed {speed:g} slows a real arm that tosses; rig '{setup.rig.name}' moves none: leave it out"
+        )
+    config = replace(setup.rig.recording, longest_toss_s=setup.rig.recording.longest_toss_s / speed)
+    return replace(setup, rig=replace(setup.rig, recording=config))
+
+
+def _dry_run(setup: Setup, tosses: int, speed: float) -> Outcome:
     """Plans only: what would be tossed, and how near to the limits."""
-    thrower = make_thrower(setup, None, operator)
+    thrower = make_thrower(setup, None, Nobody(), speed)
     planned = []
     for toss in range(tosses):
         plan = thrower.plan(toss) if hasattr(thrower, "plan") else None
@@ -135,19 +172,27 @@ def _dry_run(setup: Setup, tosses: int, operator: Operator) -> Outcome:
         + " m/s"
         for p in planned
     ]
+    lines += _unchecked(setup)
     return Outcome({"tosses": planned}, "\n".join([*lines, "nothing moved, nothing was written"]))
 
 
-def make_thrower(setup: Setup, recorder: Recorder | None, operator: Operator) -> Thrower:
-    """The simulated lab's own, the arm of a rig with [toss], or a person's hand."""
-    rig = setup.rig
-    if setup.lab is not None or rig.toss is None or rig.robot is None or not rig.of_kind("arm"):
-        return setup.thrower
-    from acquisition.arm_thrower import ArmThrower, base_in_world
-    from acquisition.toss_limits import arm_model
+def _unchecked(setup: Setup) -> list[str]:
+    """What plans of a real arm did not know."""
+    lines = []
+    if setup.moves_arm and setup.calibration.find("world", "base") is None:
+        lines.append("not calibrated: planned from world_from_base of the rig file; no arm is moved by it")
+    if setup.moves_arm and setup.rig.workspace is None:
+        lines.append("no [workspace]: only the arm itself and the table were kept clear; no arm is moved without it")
+    return lines
 
-    base = base_in_world(rig.toss, setup.calibration)
-    return ArmThrower(arm_model(rig.robot), base, rig.toss, recorder, operator)
+
+def make_thrower(setup: Setup, recorder: Recorder | None, operator: Operator, speed: float) -> Thrower:
+    """The simulated lab's own, the arm of a rig with [toss], or a person's hand."""
+    if not setup.moves_arm:
+        return setup.thrower
+    from acquisition.arm_thrower import real_thrower
+
+    return real_thrower(setup.rig, setup.calibration, recorder, operator, speed)
 
 
 def _preview(recorder: Recorder) -> contextlib.AbstractContextManager[object]:

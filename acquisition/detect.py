@@ -37,6 +37,7 @@ LEFT_PARABOLA_M = 0.02
 FEWEST_FALLING, FALLS_WITHIN_M = 6, 0.01
 """Six frames at 30 Hz fall 3 cm off a straight line: more than this tolerance forgives."""
 STILL_M = 0.0025
+LOST_FROM_VIEW_S = 1.0
 STILL_FOR_S = 0.25
 OPENED_M = 0.002
 LONGEST_FLIGHT_S = 1.5
@@ -220,6 +221,21 @@ class TossWatcher:
             return False
         still = still_since_s([g for g in self.glimpses if g.time_s > since_s])
         return still is not None and now_s - still > STILL_FOR_S
+
+    def waits_for(self, now_s: float) -> str:
+        """What has not been seen yet of a toss that is not over, in words."""
+        since_s = flight_start_s(self.glimpses) if self.by_hand else self.released.time_s if self.released else None
+        if since_s is None:
+            return "no free fall was seen" if self.by_hand else "the fingers were not seen to open"
+        after = [g for g in self.glimpses if g.time_s > since_s]
+        if not after:
+            return "the object was not seen since it was let go: is it in the depth camera's view?"
+        if now_s - after[-1].time_s > LOST_FROM_VIEW_S:
+            return f"the object left the depth camera's view {now_s - after[-1].time_s:.1f} s ago"
+        still = still_since_s(after)
+        if still is None:
+            return "the object still moves"
+        return f"the object is still since {max(now_s - still, 0.0):.1f} s, {STILL_FOR_S:g} s are wanted"
 
     def events(self) -> TossEvents:
         """Release, first impact and rest, as far as they show in what was seen."""

@@ -153,6 +153,19 @@ class JointTrajectory:
         slope = 6 * u * (1 - u) * (q1 - q0) + (1 - 4 * u + 3 * u**2) * m0 + (3 * u**2 - 2 * u) * m1
         return q, slope / h
 
+    def sampled(self, rate_hz: float) -> Float[Array, "m j"]:
+        """Positions at every cycle of a control loop, from the start on to just after the end; as `at` gives them."""
+        cycles = np.arange(int(np.ceil(self.duration_s * rate_hz)) + 1) / rate_hz
+        if len(self.time_s) == 1:
+            return np.repeat(self.q_rad, len(cycles), axis=0)
+        t = np.clip(cycles, self.time_s[0], self.time_s[-1])
+        i = np.clip(np.searchsorted(self.time_s, t, side="right") - 1, 0, len(self.time_s) - 2)
+        h = (self.time_s[i + 1] - self.time_s[i])[:, None]
+        u = (t - self.time_s[i])[:, None] / h
+        rise = 3 * u**2 - 2 * u**3
+        turns = (u - 2 * u**2 + u**3) * self.dq_rad_s[i] + (u**3 - u**2) * self.dq_rad_s[i + 1]
+        return self.q_rad[i] + rise * (self.q_rad[i + 1] - self.q_rad[i]) + h * turns
+
     @property
     def duration_s(self) -> float:
         return float(self.time_s[-1])
@@ -277,6 +290,9 @@ class Arm(Device, Protocol):
         """Begin to follow it; returns at once. Raises DeviceRefused when the arm is not ready, does not stand at the
         trajectory's start, or is moving."""
 
+    def may_move(self) -> None:
+        """Raises DeviceRefused, saying what to do, where the arm or this computer is not fit for a motion now."""
+
     def motion(self) -> Motion: ...
 
     def halt(self) -> None:
@@ -284,6 +300,14 @@ class Arm(Device, Protocol):
 
     def recover(self) -> None:
         """Leave a reflex. Raises DeviceRefused while the user stop is pressed."""
+
+
+@runtime_checkable
+class TakesLoad(Protocol):
+    """An arm that is told what its hand holds. Others are told at their panel."""
+
+    def set_load(self, mass_kg: float, centre_flange_m: Float[Array, "3"], radius_m: float) -> None:
+        """A full ball of this mass about a point in the flange's frame; mass 0: nothing. Not during a motion."""
 
 
 @runtime_checkable

@@ -9,10 +9,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray as Array
 
-from acquisition.toss_limits import ArmModel, arm_model
-
-PAYLOAD_KG, PAYLOAD_RADIUS_M = 0.3, 0.04
-"""What is tossed."""
+from acquisition.toss_limits import ArmModel, Held, arm_model
 
 
 def torques(
@@ -21,37 +18,39 @@ def torques(
     """Joint torques in Nm, by the recursive Newton-Euler algorithm; the base stands upright."""
     import pinocchio as pin
 
-    dynamics, data = _dynamics(model.name)
+    dynamics, data = _dynamics(model.name, model.held)
     pad = np.zeros(dynamics.nv - model.joints)
     rows = (tuple(np.append(part, pad) for part in row) for row in zip(q_rad, dq_rad_s, ddq_rad_s2))
     return np.array([pin.rnea(dynamics, data, *row)[: model.joints] for row in rows])
 
 
 @cache
-def _dynamics(name: str) -> tuple[Any, Any]:
+def _dynamics(name: str, held: Held) -> tuple[Any, Any]:
     model = arm_model(name)
-    dynamics = _from_bodies(model) if model.bodies else _from_urdf()
+    dynamics = _from_bodies(model, held) if model.bodies else _from_urdf(held)
     return dynamics, dynamics.createData()
 
 
-def _payload() -> Any:
+def _payload(held: Held) -> Any:
+    """A full ball about the object's centre of mass."""
     import pinocchio as pin
 
-    return pin.Inertia.FromSphere(PAYLOAD_KG, PAYLOAD_RADIUS_M)
+    ball = pin.Inertia.FromSphere(held.mass_kg, held.radius_m)
+    return pin.Inertia(ball.mass, np.array(held.centre_m), ball.inertia)
 
 
-def _from_urdf() -> Any:
+def _from_urdf(held: Held) -> Any:
     import pinocchio as pin
 
     from recordings.robot import PANDA_TOOL, panda_urdf
 
     dynamics = pin.buildModelFromUrdf(str(panda_urdf()))
     hand = dynamics.frames[dynamics.getFrameId(PANDA_TOOL)]
-    dynamics.appendBodyToJoint(hand.parentJoint, _payload(), hand.placement)
+    dynamics.appendBodyToJoint(hand.parentJoint, _payload(held), hand.placement)
     return dynamics
 
 
-def _from_bodies(model: ArmModel) -> Any:
+def _from_bodies(model: ArmModel, held: Held) -> Any:
     """The same chain of joints as `model.robot`, each link with its mass."""
     import pinocchio as pin
 
@@ -70,5 +69,5 @@ def _from_bodies(model: ArmModel) -> Any:
             xx, yy, zz, xy, xz, yz = body.inertia_kgm2
             inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
             dynamics.appendBodyToJoint(number, pin.Inertia(body.mass_kg, np.array(body.centre_m), inertia), place)
-    dynamics.appendBodyToJoint(carried[model.tool][0], _payload(), carried[model.tool][1])
+    dynamics.appendBodyToJoint(carried[model.tool][0], _payload(held), carried[model.tool][1])
     return dynamics

@@ -38,6 +38,9 @@ class Operator(Protocol):
     def key(self) -> Key | None:
         """A key pressed since the last call."""
 
+    def touched(self) -> bool:
+        """Whether any key was pressed since the last call, whatever it is; it counts for nothing else."""
+
     def wait_for_start(self) -> Key:
         """`start`, or `quit`."""
 
@@ -46,6 +49,9 @@ class Operator(Protocol):
 
     def note(self) -> str:
         """A line about the take."""
+
+    def line(self, question: str) -> str:
+        """The answer to a question; empty where nobody is there."""
 
 
 class Nobody:
@@ -63,6 +69,9 @@ class Nobody:
     def key(self) -> Key | None:
         return None
 
+    def touched(self) -> bool:
+        return False
+
     def wait_for_start(self) -> Key:
         return "start"
 
@@ -71,6 +80,19 @@ class Nobody:
 
     def note(self) -> str:
         return ""
+
+    def line(self, question: str) -> str:
+        return ""
+
+
+class Unattended(Nobody):
+    """`--yes` with an arm that may move unattended: asks nobody, yet a key at its terminal stops it."""
+
+    def touched(self) -> bool:
+        if not sys.stdin.isatty() or not select.select([sys.stdin], [], [], 0.0)[0]:
+            return False
+        os.read(sys.stdin.fileno(), 1024)
+        return True
 
 
 class Keyboard(Nobody):
@@ -93,6 +115,12 @@ class Keyboard(Nobody):
         self._typed = self._typed[length:]
         return KEYS.get(pressed.lower())
 
+    def touched(self) -> bool:
+        """The end of the input is a key, too: nobody could stop anything any more."""
+        self._listen(0.0)
+        typed, self._typed = self._typed, ""
+        return bool(typed) or self._closed
+
     def _listen(self, seconds: float) -> None:
         """Past Python's own buffer, which `select` cannot see into."""
         if not self._closed and select.select([sys.stdin], [], [], seconds)[0]:
@@ -112,7 +140,10 @@ class Keyboard(Nobody):
         raise KeyboardInterrupt
 
     def note(self) -> str:
-        self.say("note, then Enter:")
+        return self.line("note, then Enter:")
+
+    def line(self, question: str) -> str:
+        self.say(question)
         with _lines(sys.stdin):
             while "\n" not in self._typed and not self._closed:
                 self._listen(POLL_S)

@@ -85,6 +85,7 @@ class Recorder:
         self._mappers: dict[tuple[str, str], ClockMapper] = {}
         self._leads: dict[tuple[str, str], str] = {}
         self._gates: dict[str, Gate] = {}
+        self._not_put_away: dict[str, str] = {}
         self._stop = threading.Event()
         self._take: Take | None = None
         self._ended_at_ns = 0
@@ -115,13 +116,13 @@ class Recorder:
         """Stop reading, work off the lanes, close the devices: none of it waits for a device that hangs."""
         self._stop.set()
         for device in self.devices.values():
-            _quietly(device.stop)
+            self._put_away(device.name, device.stop)
         for pump in self._pumps:
             pump.join(1.0)
         for lane in self.lanes.values():
             lane.stop(1.0)
         for device in self.devices.values():
-            _quietly(device.close)
+            self._put_away(device.name, device.close)
 
     def begin(self, writer: TossWriter, host_ns: int) -> None:
         """Write what came since `host_ns`, as far as the ring reaches back, and everything from now on."""
@@ -173,6 +174,16 @@ class Recorder:
 
     def tell(self, trouble: Trouble) -> None:
         self._troubles.append(trouble)
+
+    def _put_away(self, name: str, call: Callable[[], object]) -> None:
+        """Stop or close a device, whatever its driver does: the others come next, and what went wrong is told."""
+        try:
+            call()
+        except Exception as fault:
+            text = f"{getattr(call, '__name__', 'put away')} failed: {type(fault).__name__}: {fault}"
+            if self._not_put_away.get(name) != text:  # a lost device is closed again and again
+                self._not_put_away[name] = text
+                self.tell(Trouble(time.monotonic_ns(), name, "not put away", text, "warning"))
 
     def clocks(self) -> dict[str, dict[str, Any]]:
         """The mapping of every device clock, with its error, as JSON."""
@@ -431,7 +442,7 @@ class _Pump(threading.Thread):
         gone_ns = time.monotonic_ns()
         self._tell("lost", why, "error")
         while not stop.wait(REOPEN_EVERY_S):
-            _quietly(self._device.close)
+            self._recorder._put_away(self._entry.name, self._device.close)
             try:
                 self._device.open()
                 self._device.start()
@@ -480,11 +491,3 @@ def _jpeg(pixels: Array, quality: int) -> bytes:
     if not done:
         raise TosslabError("OpenCV could not encode a JPEG image")
     return data.tobytes()
-
-
-def _quietly(call: Any) -> None:
-    """A device that fails while it is put away has nothing more to say."""
-    try:
-        call()
-    except Exception:
-        pass

@@ -90,8 +90,37 @@ class TossConfig:
     open_speed_m_s: float = 0.1
     grasp_force_n: float = 40.0
     object_width_m: float = 0.05
+    held_mass_kg: float | None = None
+    """Of the object, weighed; None: it is asked for when a session begins."""
+    held_centre_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """The object's centre of mass from the point between the fingers, in the tool's frame."""
+    held_radius_m: float = 0.05
+    """No point of the object is farther from the point between the fingers: it is kept clear like the arm."""
     world_from_base: tuple[float, ...] | None = None
-    """x y z yaw_deg of the robot's base, where no calibration says it."""
+    """x y z yaw_deg of the robot's base, for dry runs before it is calibrated; no arm moves by it."""
+
+
+@dataclass(frozen=True)
+class Post:
+    """Something that stands in the arm's way: a cylinder with round ends, in the world."""
+
+    name: str
+    from_m: tuple[float, float, float]
+    to_m: tuple[float, float, float]
+    radius_m: float
+
+
+@dataclass(frozen=True)
+class Workspace:
+    """Where the arm may be, in the world (on the table, z up). No part of it but its foot leaves the box."""
+
+    lower_m: tuple[float, float, float]
+    upper_m: tuple[float, float, float]
+    posts: tuple[Post, ...]
+    """Empty where there are none: that has to be said."""
+    cameras: Mapping[str, Any] = field(default_factory=dict)
+    """name = [x, y, z] of cameras that the calibration does not place (or that are not in the rig)."""
+    camera_radius_m: float = 0.1
 
 
 @dataclass(frozen=True)
@@ -110,6 +139,10 @@ class Rig:
     recording: RecordingConfig = field(default_factory=RecordingConfig)
     toss: TossConfig | None = None
     """None: tossed by hand."""
+    workspace: Workspace | None = None
+    """A real arm moves nowhere without it."""
+    unattended: bool = False
+    """A real arm may move with `--yes`: somebody has fenced it off and answers for it."""
     board: Mapping[str, Any] = field(default_factory=dict)
     """The calibration board: kind = "charuco", "chessboard" or "tags" with its sizes; empty: tosslab's own tags."""
     simulation: Mapping[str, Any] = field(default_factory=dict)

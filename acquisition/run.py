@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from acquisition.asked import count_down, stopped
 from acquisition.detect import Eye, TossEvents, TossWatcher
 from acquisition.devices import Arm, DeviceLost, DeviceRefused, Gripper
 from acquisition.gate import Trouble
@@ -32,6 +33,8 @@ from recordings.tracks import RigCalibration
 
 POLL_S = 0.02
 SLOW_S = 2.0
+WAITS_AFTER_S = 4.0
+"""After so long a take that does not end says what it waits for, and again after as long."""
 PLAYED = "end of the recording"
 ENDS_TAKE = ("lost", "silent", "reflex", "user_stopped", "error", "disk", "fault", "motion")
 
@@ -115,7 +118,7 @@ class SessionRun:
             check_disk(self.session.folder, self._rate_bytes_s, self.config.longest_toss_s, self.config.reserve_gb)
             opened = self._open(toss) if self.config.between_tosses else None
             plan = self.thrower.prepare(toss, attempt, self.progress)
-            if self.operator.wait_for_start() == "quit":
+            if not self._started():
                 report.stopped = "quit"
                 self._drop(toss, opened)
                 break
@@ -153,7 +156,6 @@ class SessionRun:
                 self.session.discard(toss)
 
     def _take(self, toss: int, plan: TossPlan | None, fixed_s: float | None, opened: Opened | None) -> TossReport:
-        self._count_down()
         opened = opened or self._open(toss)
         writer, before = opened.writer, opened.before
         take = _Running(self, plan, fixed_s)
@@ -165,7 +167,7 @@ class SessionRun:
             troubles = take.troubles + self.recorder.troubles()
             counts = self._counts(before)
             expects_toss = fixed_s is None and ended_by != PLAYED
-            verdict = judge(counts, troubles, events, self.config, expects_toss, take.write_failure)
+            verdict = judge(counts, troubles, events, self.config, expects_toss, take.write_failure, take.waited_for)
             decision: str = self.operator.decide(verdict)
         except BaseException:
             with self.interrupts.shield():
@@ -214,10 +216,13 @@ class SessionRun:
         except WriteFailed:
             pass  # what the disk took can be recovered
 
-    def _count_down(self) -> None:
-        for left in range(int(self.config.countdown_s), 0, -1):
-            self.operator.say(str(left))
-            time.sleep(1.0)
+    def _started(self) -> bool:
+        """A start and its countdown, which any key stops; false for quit."""
+        while self.operator.wait_for_start() != "quit":
+            if count_down(self.operator, self.config.countdown_s):
+                return True
+            self.operator.say("stopped: nothing moved")
+        return False
 
     def _close(self) -> None:
         """Wait for the lanes; stays answerable to Ctrl-C, and says so when the disk keeps everybody waiting."""
@@ -289,6 +294,8 @@ class _Running:
         self.began_s = time.monotonic()
         self.seconds = 0.0
         self.write_failure = ""
+        self.waited_for = ""
+        """Of a take that was cut at the longest time: what had not happened."""
         self._throw: Throw | None = None
         before_ns = time.monotonic_ns() - round(run.config.pre_trigger_s * 1e9)
         self._seen_look_ns = self._seen_width_ns = before_ns
@@ -319,6 +326,7 @@ class _Running:
         """Stay until the toss is over; returns what ended the take."""
         run, config = self._run, self._run.config
         rested_s: float | None = None
+        say_s = time.monotonic() + WAITS_AFTER_S
         while True:
             time.sleep(POLL_S)
             now_s = time.monotonic()
@@ -340,9 +348,22 @@ class _Running:
                 rested_s = now_s
             if rested_s is not None and now_s - rested_s >= config.after_rest_s:
                 return "rest"
+            if rested_s is None and now_s > say_s:
+                run.operator.say(f"still recording after {self.seconds:.0f} s: {self.waits_for()}. x: stop")
+                say_s = now_s + WAITS_AFTER_S
             if self.seconds > config.longest_toss_s:
                 self.halt()
+                self.waited_for = self.waits_for()
                 return "longest toss"
+
+    def waits_for(self) -> str:
+        """Why the take goes on, in words."""
+        if self._throw is not None and not self._throw.over():
+            return "the arm still moves"
+        if self._run.eye is None:
+            return "no calibrated depth camera watches the object, so that its rest is not seen"
+        now_s = self._run.recorder.clock.session_ns(time.monotonic_ns()) / 1e9
+        return self.watcher.waits_for(now_s)
 
     def _trouble(self) -> str:
         fresh = self._run.recorder.troubles() + self._run.watch_silence()
@@ -354,6 +375,9 @@ class _Running:
         return next((t.kind for t in fresh if t.level == "error" and t.kind in ENDS_TAKE), "")
 
     def _key(self) -> str:
+        """Any key stops an arm that moves; else what the key says."""
+        if self._throw is not None and not self._throw.over():
+            return "stop key" if stopped(self._run.operator) else ""
         key = self._run.operator.key()
         if key == "note":
             now_ns = self._run.recorder.clock.session_ns(time.monotonic_ns())

@@ -41,6 +41,12 @@ class Setup:
     live: bool = True
     """False: a recording, which has nothing to say before it is played."""
 
+    @property
+    def moves_arm(self) -> bool:
+        """Whether tosses move a real arm."""
+        rig = self.rig
+        return self.lab is None and self.live and bool(rig.toss and rig.robot and rig.of_kind("arm"))
+
 
 def set_up(name: str) -> Setup:
     """The rig of `--rig`: a shipped name, a TOML file, or `replay:SESSION`."""

@@ -8,7 +8,7 @@ jerk-limited (ruckig), all joints in step. What breaks a limit is refused with t
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -19,6 +19,7 @@ from acquisition.dynamics import torques
 from acquisition.kinematics import Batch, joint_bounds
 from acquisition.rig import TossConfig
 from acquisition.toss_limits import SHARE, ArmModel
+from acquisition.workspace import TOSS_SPARE_M, Contact, Space
 from recordings.errors import TosslabError
 from recordings.geometry import Transform, rotation_exp
 
@@ -33,8 +34,6 @@ RETREAT_M = 0.08
 WINDOW_SIGMAS = 4.0
 SHORTEST_WINDOW_S = 0.03
 STAND_S = 0.05
-CLEARANCE_M = 0.01
-TABLE_CLEARANCE_M = 0.015
 SEEDS = 12
 NUMERIC_SLACK = 1e-6
 
@@ -103,8 +102,6 @@ class Breach:
 
     def __str__(self) -> str:
         where = f"{self.what} of {self.part} at {self.time_s:.3f} s: {self.value:.4g} {self.unit}"
-        if self.what in ("distance", "height"):
-            return f"{where}, at least {self.limit:.4g} is wanted"
         return f"{where}, allowed are {self.limit:.4g} ({SHARE:g} of the limit)"
 
 
@@ -126,12 +123,12 @@ def draw_target(config: TossConfig, toss: int, attempt: int = 0) -> TossTarget:
     )
 
 
-def plan_toss(model: ArmModel, world_from_base: Transform, target: TossTarget, delay: ReleaseDelay) -> TossPlan:
-    """A trajectory through the wanted release, within SHARE of every limit and clear of table and arm.
+def plan_toss(model: ArmModel, space: Space, target: TossTarget, delay: ReleaseDelay) -> TossPlan:
+    """A trajectory through the wanted release, within SHARE of every limit and clear of all that is in the space.
 
     Raises TossRefused with the joint, the time and the value of what stood in the way of the best attempt.
     """
-    base_from_world = world_from_base.inverse()
+    base_from_world = space.world_from_base.inverse()
     base_from_tool = base_from_world @ target.world_from_tool
     twist = np.concatenate(
         [
@@ -139,13 +136,13 @@ def plan_toss(model: ArmModel, world_from_base: Transform, target: TossTarget, d
             base_from_world.vectors(target.angular_velocity_world_rad_s[None])[0],
         ]
     )
-    table_base_m = base_from_world.points(np.zeros((1, 3)))[0]
-    up_base = base_from_world.vectors(np.array([[0.0, 0.0, 1.0]]))[0]
-    best: Breach | None = None
+    best: Breach | Contact | None = None
     for q, dq in _releases(model, base_from_tool, twist):
-        breach = _speed_breach(model, dq)
-        for run_up_s in RUN_UPS_S if breach is None else ():
-            plan, breach = _attempt(model, q, dq, run_up_s, delay, table_base_m, up_base)
+        breach: Breach | Contact | None = _speed_breach(model, dq)
+        run_ups_s = RUN_UPS_S if breach is None else ()
+        for run_up_s in run_ups_s:
+            plan, wrong = _attempt(model, q, dq, run_up_s, delay, space)
+            breach = breach or wrong
             if plan is not None:
                 trajectory, release_s, window_s = plan
                 return TossPlan(
@@ -168,18 +165,19 @@ def plan_toss(model: ArmModel, world_from_base: Transform, target: TossTarget, d
     raise TossRefused(f"the toss is refused: {best}; ask for a slower release or another place of it")
 
 
-def plan_move(
-    model: ArmModel, from_rad: Float[Array, " j"], to_rad: Float[Array, " j"], share: float = 0.3
-) -> JointTrajectory:
-    """A calm motion between two poses at rest, clear of the arm itself. Raises TossRefused."""
-    still = np.zeros(model.joints)
-    part = _ruckig(model, (from_rad, still), (to_rad, still), share, 0.1)
-    if part is None:
-        raise TossRefused(f"no motion of the {model.name} to the start of the toss; move it there by hand")
-    breach = _clearance_breach(model, part, None, None)
-    if breach is not None:
-        raise TossRefused(f"the way to the start is refused: {breach}; move the arm by hand first")
-    return JointTrajectory(part.time_s, part.q, part.dq)
+def slowed(plan: TossPlan, speed: float) -> TossPlan:
+    """The same path at `speed` (0 to 1) times its speed: a rehearsal, at which the object falls more than it flies."""
+    t = plan.trajectory
+    release_s = plan.release_s / speed
+    return replace(
+        plan,
+        trajectory=JointTrajectory(t.time_s / speed, t.q_rad, t.dq_rad_s * speed),
+        release_s=release_s,
+        command_s=release_s - (plan.release_s - plan.command_s),
+        linear_velocity_world_m_s=plan.linear_velocity_world_m_s * speed,
+        angular_velocity_world_rad_s=plan.angular_velocity_world_rad_s * speed,
+        window_s=plan.window_s / speed,
+    )
 
 
 def check_limits(model: ArmModel, samples: Samples) -> Breach | None:
@@ -240,9 +238,8 @@ def _attempt(
     dq: Float[Array, " j"],
     run_up_s: float,
     delay: ReleaseDelay,
-    table_base_m: Float[Array, "3"],
-    up_base: Float[Array, "3"],
-) -> tuple[tuple[JointTrajectory, float, float] | None, Breach | None]:
+    space: Space,
+) -> tuple[tuple[JointTrajectory, float, float] | None, Breach | Contact | None]:
     """Run-up, window, braking with retreat; the first gentleness that keeps all limits."""
     window_s = max(WINDOW_SIGMAS * delay.sigma_s, SHORTEST_WINDOW_S)
     enters, leaves = q - 0.5 * window_s * dq, q + (0.5 * window_s + OPENING_S) * dq
@@ -252,14 +249,14 @@ def _attempt(
     back = np.linalg.pinv(J, rcond=1e-3) @ np.append(-RETREAT_M * approach, np.zeros(3))
     ends = leaves + 0.5 * run_up_s * dq + back
     still = np.zeros(model.joints)
-    breach: Breach | None = None
+    breach: Breach | Contact | None = None
     for share in GENTLENESS:
-        up = _ruckig(model, (starts, still), (enters, dq), SHARE, share)
-        down = _ruckig(model, (leaves, dq), (ends, still), SHARE, share)
+        up = limited_motion(model, (starts, still), (enters, dq), SHARE, share)
+        down = limited_motion(model, (leaves, dq), (ends, still), SHARE, share)
         if up is None or down is None:
             continue
         samples = _joined(up, dq, window_s + OPENING_S, down)
-        breach = check_limits(model, samples) or _clearance_breach(model, samples, table_base_m, up_base)
+        breach = check_limits(model, samples) or space.contact(model, samples.q, TOSS_SPARE_M)
         if breach is None:
             release_s = STAND_S + float(up.time_s[-1]) + 0.5 * window_s
             return (JointTrajectory(samples.time_s, samples.q, samples.dq), release_s, window_s), None
@@ -268,7 +265,7 @@ def _attempt(
     return None, breach
 
 
-def _ruckig(
+def limited_motion(
     model: ArmModel,
     start: tuple[Float[Array, " j"], Float[Array, " j"]],
     end: tuple[Float[Array, " j"], Float[Array, " j"]],
@@ -338,27 +335,3 @@ def _breach(
     name = model.robot.arm_joints[int(joint)].name
     what = "distance from the middle of the range" if what == "position" else what
     return Breach(what, name, float(time_s[row]), float(values[row, joint]), SHARE * float(limits[joint]), unit)
-
-
-def _clearance_breach(
-    model: ArmModel, samples: Samples, table_base_m: Float[Array, "3"] | None, up_base: Float[Array, "3"] | None
-) -> Breach | None:
-    """Arm against itself and against the table, every 10 ms."""
-    batch = Batch(model)
-    q, t = samples.q[::10], samples.time_s[::10]
-    gaps, which = batch.clearances(q)
-    k = int(gaps.argmin())
-    if gaps[k] < CLEARANCE_M:
-        links = [model.capsules[i].link for i in which[k]]
-        return Breach("distance", " and ".join(links), float(t[k]), float(gaps[k]), CLEARANCE_M, "m")
-    if table_base_m is None or up_base is None:
-        return None
-    a, b = batch.segments(q)
-    radius = np.array([c.radius_m for c in model.capsules])
-    heights = np.minimum((a - table_base_m) @ up_base, (b - table_base_m) @ up_base) - radius
-    heights[:, [i for i, c in enumerate(model.capsules) if c.link == model.robot.root]] = np.inf
-    row, part = np.unravel_index(int(heights.argmin()), heights.shape)
-    if heights[row, part] < TABLE_CLEARANCE_M:
-        link = model.capsules[int(part)].link
-        return Breach("height", link, float(t[row]), float(heights[row, part]), TABLE_CLEARANCE_M, "m over the table")
-    return None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
@@ -37,6 +37,15 @@ class Body:
     inertia_kgm2: tuple[float, float, float, float, float, float]
 
 
+@dataclass(frozen=True)
+class Held:
+    """What the hand holds: mass, centre of mass in the tool's frame, and the ball about the tool that it is within."""
+
+    mass_kg: float = 0.3
+    centre_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    radius_m: float = 0.04
+
+
 @dataclass(frozen=True, eq=False)
 class ArmModel:
     """An arm as the planner sees it. Limits per joint, from the base on; `tool` is the link that holds the object.
@@ -58,6 +67,14 @@ class ArmModel:
     capsules: tuple[Capsule, ...]
     source: str
     bodies: tuple[Body, ...] = ()
+    held: Held = Held()
+    flange: str = ""
+    """The link that the hand is fixed to."""
+
+    def holding(self, held: Held) -> ArmModel:
+        """The same arm with this in its hand: its weight is carried, its ball is kept clear like a link."""
+        ball = Capsule(self.tool, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), held.radius_m)
+        return replace(self, held=held, capsules=(*self.capsules, ball))
 
     @property
     def joints(self) -> int:
@@ -66,6 +83,11 @@ class ArmModel:
     def base_from_tool(self, q_rad: Float[Array, " j"]) -> Transform:
         found = self.robot.links(q_rad)[self.tool]
         return Transform("base", "tool", found.rotation, found.translation_m)
+
+    def tool_in_flange(self, point_tool_m: Float[Array, "3"]) -> Float[Array, "3"]:
+        """A point of the tool's frame in the flange's."""
+        links = self.robot.links(self.ready_rad)
+        return (links[self.flange].inverse() @ links[self.tool]).points(point_tool_m[None])[0]
 
     def jacobian(self, q_rad: Float[Array, " j"], point_base_m: Float[Array, "3"]) -> Float[Array, "6 j"]:
         """Velocity and angular velocity, in base axes, of a point fixed to the tool, per joint speed."""
@@ -118,6 +140,7 @@ def panda_model() -> ArmModel:
             Capsule("panda_hand", (0.0, -0.04, 0.085), (0.0, 0.04, 0.085), 0.02),
         ),
         source="libfranka 0.9 rate_limiting.h; Franka control parameters of the Panda (FER)",
+        flange="panda_link8",
     )
 
 
@@ -170,6 +193,7 @@ def ur5e_model() -> ArmModel:
         ),
         source="Universal Robots' data sheet and its page of DH parameters; acceleration and jerk chosen here",
         bodies=UR5E_BODIES,
+        flange="link6",
     )
 
 

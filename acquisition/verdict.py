@@ -48,6 +48,7 @@ def judge(
     config: RecordingConfig,
     expects_toss: bool = True,
     write_failure: str = "",
+    waited_for: str = "",
 ) -> Verdict:
     """The recorder's own verdict; a person may overrule it."""
     reasons, warnings = [], []
@@ -66,6 +67,8 @@ def judge(
             reasons.append(f"{topic}: {lost} of {whole} lost {_causes(tally)}")
         elif lost or again:
             warnings.append(f"{topic}: {lost} of {whole} lost {_causes(tally)}")
+    if waited_for:
+        warnings.append(f"cut after {config.longest_toss_s:g} s ([recording] longest_toss_s): {waited_for}")
     if expects_toss:
         missing = [
             name

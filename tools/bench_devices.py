@@ -64,7 +64,7 @@ def panda(count: int) -> None:
 
     began = cpu_s()
     with Apart("fci", host=f"{HOST}1") as simulator:
-        with FrankaArm(host=f"{HOST}1") as arm:
+        with FrankaArm(host=f"{HOST}1", realtime="ignore") as arm:
             missed, ticks, lost = tosses(arm, count)
         server = simulator.snapshot()
     clean = sum(m == 0 for m in missed)

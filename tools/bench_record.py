@@ -54,6 +54,7 @@ from acquisition.toss import (  # noqa: E402
 )
 from acquisition.toss_limits import arm_model  # noqa: E402
 from acquisition.verdict import Verdict  # noqa: E402
+from acquisition.workspace import Space  # noqa: E402
 from recordings.geometry import Transform, rotation_exp  # noqa: E402
 from recordings.progress import Silent  # noqa: E402
 from recordings.session import Session  # noqa: E402
@@ -410,7 +411,7 @@ def bench_plans(count: int, part: str) -> bool:
                 velocity_spread_m_s=0.0,
             )
             try:
-                plan = plan_toss(model, base, draw_target(config, 0), ReleaseDelay(0.06, 0.01))
+                plan = plan_toss(model, Space.of_table(base), draw_target(config, 0), ReleaseDelay(0.06, 0.01))
             except TossRefused as refused:
                 text = str(refused)
                 why[text.split(": ")[1].split(" at ")[0] if "refused: " in text else "out of reach"] += 1

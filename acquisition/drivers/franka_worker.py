@@ -6,8 +6,10 @@ between two states, in the callback.
 
 from __future__ import annotations
 
+import json
 import sys
 import time
+from collections.abc import Callable
 from typing import Any, NoReturn
 
 import numpy as np
@@ -51,15 +53,20 @@ class ArmLoop:
             path = np.frombuffer(blob, dtype=np.float64).reshape(-1, JOINTS)
             return Follower(self._end, self._lib, self._robot, self._log, path).run()
         if message["do"] == "recover":
-            self._end.event("recovered", reason=self._recover())
+            self._answer(self._robot.automatic_error_recovery)
+        elif message["do"] == "load":
+            ball = (message["inertia"] * np.eye(3)).ravel().tolist()
+            self._answer(lambda: self._robot.set_load(message["mass"], message["centre"], ball))
         return message["do"] != "quit"
 
-    def _recover(self) -> str:
+    def _answer(self, call: Callable[[], object]) -> None:
+        """Do it, and tell the driver why not."""
+        reason = ""
         try:
-            self._robot.automatic_error_recovery()
+            call()
         except RuntimeError as error:
-            return str(error)
-        return ""
+            reason = str(error)
+        self._end.event("answer", reason=reason)
 
     def _log_and_look(self, state: Any) -> bool:
         self._log(state)
@@ -164,6 +171,14 @@ def _reason(state: Any) -> str:
     return ", ".join(flags)
 
 
+def guard(robot: Any, torque_nm: float, force_n: float) -> None:
+    """Where the arm stops by itself: this much while it speeds up or brakes, half at constant speed; no load yet."""
+    torque, force = [torque_nm] * JOINTS, [force_n] * 6
+    half_torque, half_force = [torque_nm / 2] * JOINTS, [force_n / 2] * 6
+    robot.set_collision_behavior(torque, torque, half_torque, half_torque, force, force, half_force, half_force)
+    robot.set_load(0.0, [0.0] * 3, [0.0] * 9)
+
+
 def main() -> NoReturn:
     end = WorkerEnd()
     host, realtime = sys.argv[1], sys.argv[2]
@@ -175,6 +190,7 @@ def main() -> NoReturn:
     try:
         config = {"ignore": libfranka.RealtimeConfig.kIgnore, "enforce": libfranka.RealtimeConfig.kEnforce}[realtime]
         robot = libfranka.Robot(host, config)
+        guard(robot, **json.loads(sys.argv[3]))
     except RuntimeError as error:
         end.event("failed", kind="connect", reason=str(error))
         end.leave()

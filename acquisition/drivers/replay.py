@@ -306,6 +306,9 @@ class ReplayArm(_Replayed):
     def move(self, trajectory: JointTrajectory) -> None:
         raise DeviceRefused(f"{self.name} is a recording: it does not move")
 
+    def may_move(self) -> None:
+        raise DeviceRefused(f"{self.name} is a recording: it does not move")
+
     def motion(self) -> Motion:
         return Motion("none")
 

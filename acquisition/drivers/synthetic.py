@@ -576,6 +576,9 @@ class SyntheticArm(_Device):
             raise DeviceRefused(f"{self.name} stands in {self._mode()}; release the stop, then recover")
         self._lab.arm.move(trajectory)
 
+    def may_move(self) -> None:
+        """A simulated arm hurts nobody."""
+
     def motion(self) -> Motion:
         return self._lab.arm.motion()
 

@@ -62,6 +62,11 @@ class UrArm(WorkerArm):
                 "`host` and `serial` in the rig"
             )
 
+    def unfit(self) -> str:
+        """Safety mode and remote control, asked of the controller now."""
+        answer = self.ask_worker({"do": "check"})
+        return "its controller did not say whether it may move; check the network" if answer is None else answer
+
     def describe(self) -> dict[str, Any]:
         return {
             "kind": "arm",

@@ -32,6 +32,7 @@ CATCH_UP = 1.2
 """So many samples of the path a cycle may go on by, when it was late before."""
 SERVO_STOP_RAD_S2 = 10.0
 ROBOT_RUNNING = 7
+SAFE = "NORMAL"
 
 
 class ArmLoop:
@@ -70,8 +71,25 @@ class ArmLoop:
             if self.follower is not None:
                 self.follower.brake()
         elif message["do"] == "recover":
-            self._end.event("recovered", reason=self._recover())
+            self._end.event("answer", reason=self._recover())
+        elif message["do"] == "check":
+            self._end.event("answer", reason=self._unfit())
         return message["do"] != "quit"
+
+    def _unfit(self) -> str:
+        """What the dashboard says against a motion: the safety mode, the panel's control."""
+        try:
+            if not self._dashboard.isConnected():
+                self._dashboard.connect()
+            safety, remote = self._dashboard.safetystatus(), self._dashboard.isInRemoteControl()
+        except RuntimeError as error:
+            return f"its dashboard server does not answer ({error}); nothing was moved"
+        mode = safety.rpartition(":")[2].strip()
+        if mode != SAFE:
+            return f"its safety mode is {mode}, wanted {SAFE}; nothing was moved. Clear it at the panel"
+        if not remote:
+            return "it is in local control; nothing was moved. Switch it to remote control at the panel"
+        return ""
 
     def _recover(self) -> str:
         try:

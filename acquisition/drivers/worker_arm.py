@@ -41,7 +41,7 @@ class WorkerArm:
 
     def _clean(self) -> None:
         self._opened = threading.Event()
-        self._recovered = threading.Event()
+        self._answered = threading.Event()
         self._failure: tuple[str, str] | None = None
         self._about: dict[str, Any] = {}
         self._answer = ""
@@ -98,7 +98,19 @@ class WorkerArm:
         batches = self._inbox.take_all(timeout_s)
         return samples(self.clock, len(self.joint_names), b"".join(batches)) if batches else None
 
+    def may_move(self) -> None:
+        """Raises DeviceRefused where the arm is not idle, or the driver's own checks (`unfit`) find something."""
+        self._ready()
+        why = self.unfit()
+        if why:
+            raise DeviceRefused(f"{self.name}: {why}")
+
+    def unfit(self) -> str:
+        """What of arm or computer forbids a motion now, and what to do; empty where nothing does."""
+        return ""
+
     def move(self, trajectory: JointTrajectory) -> None:
+        self.may_move()
         worker = self._ready()
         q_now = self._q_desired
         if q_now is None:
@@ -110,8 +122,7 @@ class WorkerArm:
                 f"{self.name}: the trajectory starts {away[joint]:.3f} rad from where {self.joint_names[joint]} stands "
                 f"({q_now[joint]:.3f} rad), wanted within {START_RAD:g} rad; move to its start first"
             )
-        ticks = int(np.ceil(trajectory.duration_s * self.rate_hz)) + 1
-        path = np.stack([trajectory.at(k / self.rate_hz)[0] for k in range(ticks)])
+        path = trajectory.sampled(self.rate_hz)
         self._motion = Motion("moving", started_host_ns=time.monotonic_ns())
         worker.send({"do": "move"}, path.astype("<f8").tobytes())
 
@@ -130,13 +141,18 @@ class WorkerArm:
     def recover(self) -> None:
         if self._mode == "user_stopped":
             raise DeviceRefused(f"{self.name}: the user stop is pressed; release it, then recover again")
-        worker = self._connected()
-        self._recovered.clear()
-        worker.send({"do": "recover"})
-        if not self._recovered.wait(ANSWER_S):
+        answer = self.ask_worker({"do": "recover"})
+        if answer is None:
             raise DeviceRefused(f"{self.name}: still recovering after {ANSWER_S:g} s; ask again")
-        if self._answer:
-            raise DeviceRefused(f"{self.name}: the arm does not recover: {self._answer}")
+        if answer:
+            raise DeviceRefused(f"{self.name}: the arm does not recover: {answer}")
+
+    def ask_worker(self, message: dict[str, Any]) -> str | None:
+        """What the process answers to a request: a reason why not, empty where it did it; None: no answer in time."""
+        worker = self._connected()
+        self._answered.clear()
+        worker.send(message)
+        return self._answer if self._answered.wait(ANSWER_S) else None
 
     def health(self) -> Health:
         dropped = self._dropped + self._inbox.overflowed * BATCH
@@ -193,9 +209,9 @@ class WorkerArm:
             self._opened.set()
         elif what == "mode":
             self._mode, self._errors = MODES.get(event["mode"], "error"), event["errors"]
-        elif what == "recovered":
+        elif what == "answer":
             self._answer = event["reason"]
-            self._recovered.set()
+            self._answered.set()
         elif what == "lost":
             self._on_end(event["reason"])
         elif what == "motion":

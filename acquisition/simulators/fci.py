@@ -56,10 +56,12 @@ class FciServer:
         self._host, self._version = loopback(host), version
         self._random = random.Random(0)
         self._lock = threading.RLock()
-        self._counts = {"states": 0, "commands": 0, "missed": 0, "motions": 0, "aborted": 0}
+        self._counts = {"states": 0, "commands": 0, "missed": 0, "motions": 0, "aborted": 0, "recoveries": 0}
         self._motion = _Motion()
         self._errors = np.zeros(wire.ERROR_FLAGS, dtype=np.uint8)
         self._reflex_reason = np.zeros(wire.ERROR_FLAGS, dtype=np.uint8)
+        self._set: dict[wire.Request, list[float]] = {}
+        """The numbers of the collision thresholds and of the load, as they were last set."""
         self._stretched_s = 0.0
         self._gripper = GripperServer(self._host, self._faults, object_width_m)
         try:
@@ -86,7 +88,8 @@ class FciServer:
         """Counts, mode and joints; `stretched_s` is by how much the simulator itself was too slow."""
         with self._lock:
             joints = {"q": self.body.q.tolist(), "q_d": self.body.q_d.tolist()}
-            own = {"mode": self.mode.name, "stretched_s": self._stretched_s, **self._counts, **joints}
+            told = {request.name.lower(): numbers for request, numbers in self._set.items()}
+            own = {**told, "mode": self.mode.name, "stretched_s": self._stretched_s, **self._counts, **joints}
         return own | {"gripper": self._gripper.snapshot()}
 
     def close(self) -> None:
@@ -126,8 +129,18 @@ class FciServer:
             _reply(connection, request, command, bytes([self._recover()]))
         elif request == wire.Request.LOAD_MODEL_LIBRARY:
             _reply(connection, request, command, b"\x01")  # kError: there are no dynamics here
-        else:  # setters: taken and not used
+        elif request in wire.SETTER_NUMBERS:
+            _reply(connection, request, command, bytes([self._take(wire.Request(request), payload)]))
+        else:  # other setters: taken and not used
             _reply(connection, request, command, b"\x00")
+
+    def _take(self, request: wire.Request, payload: bytes) -> int:
+        """Keep what a setter says, for `snapshot`; refused during a motion, as by the arm."""
+        with self._lock:
+            if self.mode == wire.RobotMode.MOVE:
+                return wire.SETTER_NOT_POSSIBLE
+            self._set[request] = list(struct.unpack(f"<{wire.SETTER_NUMBERS[request]}d", payload))
+            return wire.SETTER_DONE
 
     def _begin(self, connection: socket.socket, command: int, payload: bytes) -> None:
         controller, generator = struct.unpack("<II", payload[:8])
@@ -144,6 +157,7 @@ class FciServer:
 
     def _recover(self) -> wire.RecoveryAnswer:
         with self._lock:
+            self._counts["recoveries"] += 1
             if self.mode == wire.RobotMode.USER_STOPPED:
                 return wire.RecoveryAnswer.EMERGENCY_ABORTED
             if self.mode == wire.RobotMode.MOVE:

@@ -21,8 +21,15 @@ class Request(IntEnum):
     CONNECT = 0
     MOVE = 1
     STOP_MOVE = 2
+    SET_COLLISION_BEHAVIOR = 4
+    SET_LOAD = 10
     AUTOMATIC_ERROR_RECOVERY = 12
     LOAD_MODEL_LIBRARY = 13
+
+
+SETTER_NUMBERS = {Request.SET_COLLISION_BEHAVIOR: 52, Request.SET_LOAD: 13}
+"""Doubles of a request: eight rows of thresholds (four of joints, four of forces); mass, centre, inertia."""
+SETTER_DONE, SETTER_NOT_POSSIBLE = 0, 1
 
 
 class Answer(IntEnum):

@@ -30,6 +30,8 @@ FAULTS = {
     "nan_state": "actual joints are NaN",
     "unplug": "connections are cut and refused",
     "no_script": "the controller does not run the control script (no remote control)",
+    "local_control": "somebody took the control at the panel; the script runs on",
+    "reduced": "the dashboard tells the safety mode REDUCED",
 }
 CONTROLLER_VERSION = (5, 12, 0, 0)
 POLYSCOPE = "URSoftware 5.12.0.1101319 (Mar 28 2022)"
@@ -228,13 +230,15 @@ class UrServer:
                 if self.body.safety == wire.SafetyMode.PROTECTIVE_STOP:
                     self.body.safety = wire.SafetyMode.NORMAL
                 return "Protective stop releasing"
+            local = self._faults.active("no_script") or self._faults.active("local_control")
+            safety = "REDUCED" if self._faults.active("reduced") else self.body.safety.name
             answers = {
                 "polyscopeversion": POLYSCOPE,
                 "get serial number": self._serial,
                 "get robot model": self._model,
-                "is in remote control": "false" if self._faults.active("no_script") else "true",
+                "is in remote control": "false" if local else "true",
                 "robotmode": "Robotmode: RUNNING",
-                "safetystatus": f"Safetystatus: {self.body.safety.name}",
+                "safetystatus": f"Safetystatus: {safety}",
             }
         return answers.get(line.lower(), f"could not understand: '{line}'")
 

@@ -127,3 +127,16 @@ def test_the_arm_is_not_the_object() -> None:
     raw = picture(round(float(pixel[0])), round(float(pixel[1])), 1.0 - float(elbow[2]))
     assert eye.see(0.0, raw, 0.001, None, None) is not None
     assert eye.see(0.0, raw, 0.001, model.ready_rad, None) is None
+
+
+def test_a_toss_that_is_not_over_says_what_it_waits_for() -> None:
+    assert TossWatcher().waits_for(1.0) == "the fingers were not seen to open"
+    assert TossWatcher(by_hand=True).waits_for(1.0) == "no free fall was seen"
+    whole = watched(0.0, by_hand=False)
+    unseen = TossWatcher(widths=whole.widths)
+    assert unseen.waits_for(1.5) == "the object was not seen since it was let go: is it in the depth camera's view?"
+    flying = [g for g in whole.glimpses if g.time_s < RELEASE_S + 0.3]
+    assert TossWatcher(widths=whole.widths, glimpses=flying).waits_for(1.35) == "the object still moves"
+    left = TossWatcher(widths=whole.widths, glimpses=flying).waits_for(flying[-1].time_s + 3.0)
+    assert left == "the object left the depth camera's view 3.0 s ago"
+    assert not whole.over(2.0) or "is still since" in whole.waits_for(2.0)

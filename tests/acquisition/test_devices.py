@@ -91,3 +91,13 @@ def test_a_path_begun_beside_its_start_joins_it_smoothly() -> None:
     assert joined[0, 0] == 0.01
     np.testing.assert_array_equal(joined[301:], 0)
     assert (np.diff(joined[:, 0]) <= 0).all()
+
+
+def test_a_sampled_trajectory_is_the_one_that_is_asked_for_instant_by_instant() -> None:
+    rng = np.random.default_rng(0)
+    for rows in (1, 2, 7):
+        time_s = np.concatenate([[0.0], np.cumsum(rng.uniform(0.05, 0.2, rows - 1))])
+        path = JointTrajectory(time_s, rng.normal(size=(rows, 6)), rng.normal(size=(rows, 6)))
+        sampled = path.sampled(500.0)
+        assert len(sampled) == int(np.ceil(path.duration_s * 500.0)) + 1
+        np.testing.assert_allclose(sampled, [path.at(k / 500.0)[0] for k in range(len(sampled))], atol=1e-12)

@@ -225,3 +225,16 @@ def test_frames_between_tosses_are_kept_on_request(record: Callable[..., Any]) -
         before, after = session.toss(0).color(), session.toss(1).color()
         assert after[0].index == before[len(before) - 1].index + 1
     assert_everything_is_counted(done)
+
+
+def test_a_take_that_does_not_end_says_why_while_it_runs_and_in_its_verdict(
+    record: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("acquisition.run.WAITS_AFTER_S", 0.5)
+    done = record(seconds=None, longest_toss_s=3.0)
+    said = [text for text in done.operator.told if text.startswith("still recording after")]
+    assert said
+    assert "the arm still moves" in said[0]
+    cut = next(text for text in done.take.verdict.warnings if text.startswith("cut after 3 s"))
+    assert "[recording] longest_toss_s" in cut
+    assert cut.endswith("no calibrated depth camera watches the object, so that its rest is not seen")

@@ -21,7 +21,7 @@ ATTEMPTS = 4
 
 @pytest.fixture(scope="module")
 def arm(fci: tuple[str, Apart]) -> Iterator[FrankaArm]:
-    with FrankaArm(host=fci[0]) as opened:
+    with FrankaArm(host=fci[0], realtime="ignore") as opened:
         opened.start()
         yield opened
 

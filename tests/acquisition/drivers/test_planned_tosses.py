@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 
 from acquisition import preflight
+from acquisition.approach import plan_approach
 from acquisition.arm_thrower import ArmThrower, base_in_world
 from acquisition.cli import main
 from acquisition.clock import SessionClock
@@ -23,14 +25,17 @@ from acquisition.rig import find_rig, read_rig
 from acquisition.run import Options, SessionRun
 from acquisition.setup import NO_CALIBRATION, make_device
 from acquisition.simulators.apart import Apart
-from acquisition.toss import ReleaseDelay, TossPlan, TossTarget, plan_move, plan_toss
+from acquisition.toss import ReleaseDelay, TossPlan, TossTarget, plan_toss
 from acquisition.toss_limits import ArmModel, arm_model
-from recordings.geometry import Transform
+from acquisition.workspace import Space
+from recordings.geometry import Transform, rotation_exp
 from recordings.progress import Silent
 from recordings.session import Session
 from recordings.session_writer import SessionWriter
+from recordings.tracks import RigCalibration
 from recordings.verify import verify
 
+SPACE = Space.of_table(Transform("world", "base", np.eye(3), np.zeros(3)))
 DELAY = ReleaseDelay(0.06, 0.01)
 
 
@@ -40,7 +45,7 @@ def plan(model: ArmModel, q_rad: list[float], dq_rad_s: list[float]) -> TossPlan
     at = model.base_from_tool(q)
     twist = tool_twist(model, q, dq)
     target = TossTarget(Transform("world", "tool", at.rotation, at.translation_m), twist[:3], twist[3:])
-    return plan_toss(model, Transform("world", "base", np.eye(3), np.zeros(3)), target, DELAY)
+    return plan_toss(model, SPACE, target, DELAY)
 
 
 def run(arm: Arm, trajectory: Any) -> ArmSamples:
@@ -64,11 +69,11 @@ def tool_twist(model: ArmModel, q: np.ndarray, dq: np.ndarray) -> np.ndarray:
 def test_a_planned_toss_of_the_panda_passes_its_supervision_and_releases_as_wanted(fci: tuple[str, Apart]) -> None:
     model = arm_model("panda")
     toss = plan(model, [0.0, -0.2, 0.0, -2.0, 0.0, 2.0, 0.785], [0.0, 0.4, 0.0, 0.7, 0.0, 0.6, 0.0])
-    with FrankaArm(host=fci[0]) as arm:
+    with FrankaArm(host=fci[0], realtime="ignore") as arm:
         arm.start()
         here = arm.read(2.0)
         assert here is not None
-        run(arm, plan_move(model, here.q_desired_rad[-1], toss.trajectory.q_rad[0]))
+        run(arm, plan_approach(model, SPACE, here.q_desired_rad[-1], toss.trajectory.q_rad[0]).trajectory)
         states = run(arm, toss.trajectory)
     # The arm's clock runs on: the trajectory's time counts from the first state in which it is moving.
     moving = np.flatnonzero([mode == "moving" for mode in states.modes])
@@ -87,7 +92,7 @@ def test_a_planned_toss_of_the_ur5e_runs_and_reaches_its_speed(rtde: tuple[str, 
         arm.start()
         here = arm.read(2.0)
         assert here is not None
-        run(arm, plan_move(model, here.q_desired_rad[-1], toss.trajectory.q_rad[0]))
+        run(arm, plan_approach(model, SPACE, here.q_desired_rad[-1], toss.trajectory.q_rad[0]).trajectory)
         states = run(arm, toss.trajectory)
     np.testing.assert_allclose(states.q_rad[-1], toss.trajectory.q_rad[-1], atol=2e-3)
     # servoJ follows late: the speed is judged where the arm passes the release, over 40 ms
@@ -111,7 +116,7 @@ def test_the_shipped_ur5e_rig_tosses(rtde: tuple[str, Apart], tmp_path: Path) ->
     assert rig.toss is not None
     recorder = Recorder(rig, {"arm": make_device(arm, rig.source)}, SessionClock(time.monotonic_ns(), time.time_ns()))
     base = base_in_world(rig.toss, NO_CALIBRATION)
-    thrower = ArmThrower(arm_model("ur5e"), base, rig.toss, recorder, Nobody())
+    thrower = ArmThrower(arm_model("ur5e"), Space.of_table(base), rig.toss, recorder, Nobody(), countdown_s=0.0)
     with recorder:
         time.sleep(0.5)
         with SessionWriter(tmp_path / "ur", {}) as session:
@@ -136,18 +141,21 @@ def test_the_shipped_ur5e_rig_tosses(rtde: tuple[str, Apart], tmp_path: Path) ->
 
 PANDA_RIG = """name = "fci"
 robot = "panda"
+unattended = true
+calibration = "calibration.json"
 [devices.arm]
 kind = "arm"
 driver = "franka"
 address = "ADDRESS"
 rate_hz = 1000
+settings = { realtime = "ignore" }
 [devices.gripper]
 kind = "gripper"
 driver = "franka_hand"
 address = "ADDRESS"
 rate_hz = 10
 [recording]
-countdown_s = 0
+countdown_s = 1
 longest_toss_s = 3
 longest_gap_s = 5
 queue_s = 5
@@ -156,9 +164,14 @@ redo_at_most = 5
 position_m = [0.0, 0.1, 0.35]
 velocity_m_s = [0.0, -0.6, 0.5]
 spin_rad_s = [-3.0, 0.0, 0.0]
-world_from_base = [0.0, 0.6, 0.0, -90.0]
+held_mass_kg = 0.2
 dry_openings = 4
+[workspace]
+lower_m = [-0.9, -0.6, -0.05]
+upper_m = [0.9, 0.9, 1.3]
+posts = []
 """
+BASE = Transform("world", "base", rotation_exp(np.array([0.0, 0.0, -np.pi / 2])), np.array([0.0, 0.6, 0.0]))
 
 
 def test_toss_record_tosses_with_a_panda(
@@ -168,6 +181,8 @@ def test_toss_record_tosses_with_a_panda(
     monkeypatch.setattr(preflight, "RATE_BAD", 0.9)  # on a busy machine the simulator's seconds are longer than ours
     rig, out = tmp_path / "panda.toml", tmp_path / "out"
     rig.write_text(PANDA_RIG.replace("ADDRESS", fci[0]))
+    placed = RigCalibration(cameras={}, transforms=(BASE,))
+    (tmp_path / "calibration.json").write_text(json.dumps(placed.to_json()))
     assert main(["--rig", str(rig), "--yes", str(out)]) == 0
     with Session.open(out) as session:
         delay = session.start["release_delay"]
