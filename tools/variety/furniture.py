@@ -1,4 +1,4 @@
-"""What stands about: tables of five kinds, walls, clutter, a person, a hand, a gripper. True world, z up, table z = 0."""
+"""What stands about: tables of five kinds, walls, clutter, a person, a hand, a gripper. World: z up, table z = 0."""
 
 from __future__ import annotations
 
@@ -33,7 +33,10 @@ class Item:
 
 
 def sheet(
-    half_m: tuple[float, float], cell_m: float, height_m: Float[Array, "*n"] | float, keep: Bool[Array, "*n"] | None = None
+    half_m: tuple[float, float],
+    cell_m: float,
+    height_m: Float[Array, "*n"] | float,
+    keep: Bool[Array, "*n"] | None = None,
 ) -> Solid:
     """A grid in the x-y plane, seen from above; `height_m` and `keep` (of a cell's middle) on the grid's points."""
     counts = [max(2, int(2 * h / cell_m) + 1) for h in half_m]
@@ -75,7 +78,11 @@ def flat_picture(kind: str, shape: tuple[int, int], rng: np.random.Generator) ->
         bend = 30 * noise(rng, *shape, 400.0) + 5 * noise(rng, *shape, 60.0)
         rings = 0.5 + 0.5 * np.sin((0.05 * x + bend) * rng.uniform(0.6, 2.0))
         light, dark = np.array([0.55, 0.36, 0.2]), np.array([0.3, 0.17, 0.08])
-        return rng.uniform(0.5, 1.4) * (dark + (light - dark) * rings[..., None]) * (0.9 + 0.2 * noise(rng, *shape, 3.0)[..., None])
+        return (
+            rng.uniform(0.5, 1.4)
+            * (dark + (light - dark) * rings[..., None])
+            * (0.9 + 0.2 * noise(rng, *shape, 3.0)[..., None])
+        )
     if kind == "steel":
         brushed = np.repeat(rng.random((shape[0], 1), dtype=np.float32), shape[1], 1)
         return (0.5 + 0.12 * brushed + 0.1 * noise(rng, *shape, 90.0))[..., None] * np.ones(3)
@@ -96,7 +103,9 @@ def table(kind: str, wave_m: float, rng: np.random.Generator) -> list[Item]:
     return found
 
 
-def _plain_sheet(half_m: tuple[float, float], at_m: float, value: float, rng: np.random.Generator) -> tuple[PaintedMesh, Finish]:
+def _plain_sheet(
+    half_m: tuple[float, float], at_m: float, value: float, rng: np.random.Generator
+) -> tuple[PaintedMesh, Finish]:
     solid = sheet(half_m, max(half_m), at_m)
     return painted(solid, [appearance.plain(rng, (32, 32), np.full(3, value))], 32 / (2 * half_m[0])), Finish(0.8)
 
@@ -162,7 +171,10 @@ def rod(start_m: Array, end_m: Array, radius_m: float) -> Solid:
     z = along / length
     x = np.cross(z, [0.0, 0.0, 1.0] if abs(z[2]) < 0.9 else [1.0, 0.0, 0.0])
     x /= np.linalg.norm(x)
-    return placed(shapes.turned(profile), Transform("world", "rod", np.stack([x, np.cross(z, x), z], 1), np.asarray(start_m, float)))
+    return placed(
+        shapes.turned(profile),
+        Transform("world", "rod", np.stack([x, np.cross(z, x), z], 1), np.asarray(start_m, float)),
+    )
 
 
 def brick(low_m: tuple[float, float, float], high_m: tuple[float, float, float]) -> Solid:
@@ -187,7 +199,10 @@ def hand(half_width_m: float, rng: np.random.Generator) -> Item:
 def gripper(half_width_m: float, rng: np.random.Generator) -> Item:
     """Two pads on a bar. Frame as `hand`."""
     w = half_width_m + 0.001
-    pads = [brick((s * w - (0.012 if s < 0 else 0.0), -0.01, -0.06), (s * w + (0.012 if s > 0 else 0.0), 0.01, 0.01)) for s in (-1, 1)]
+    pads = [
+        brick((s * w - (0.012 if s < 0 else 0.0), -0.01, -0.06), (s * w + (0.012 if s > 0 else 0.0), 0.01, 0.01))
+        for s in (-1, 1)
+    ]
     bar = brick((-w - 0.03, -0.025, -0.1), (w + 0.03, 0.025, -0.06))
     post = rod(np.array([0.0, 0.0, -0.1]), np.array([0.0, 0.0, -0.3]), 0.03)
     grey = np.full(3, rng.uniform(0.1, 0.8))
@@ -200,7 +215,9 @@ def person(rng: np.random.Generator) -> Item:
     arms = [rod(np.array([0.25 * s, 0, FLOOR_M + 0.9]), np.array([0.2 * s, 0, FLOOR_M + 1.4]), 0.05) for s in (-1, 1)]
     body = rod(np.array([0, 0, FLOOR_M + 0.95]), np.array([0, 0, FLOOR_M + 1.35]), 0.17)
     head = rod(np.array([0, 0, FLOOR_M + 1.58]), np.array([0, 0, FLOOR_M + 1.66]), 0.1)
-    return Item("person", colored(together([*up, *arms, body, head]), appearance.draw_color(rng, 0.5), rng), Finish(0.9))
+    return Item(
+        "person", colored(together([*up, *arms, body, head]), appearance.draw_color(rng, 0.5), rng), Finish(0.9)
+    )
 
 
 def clutter(number: int, towards_camera: Float[Array, "2"], rng: np.random.Generator) -> Item:

@@ -95,7 +95,9 @@ class Pair:
         self._still = tuple(self._lit(s, self._dark(s)) for s in self._stands)
         self._gain = self._exposed_well()
 
-    def pictures(self, instants: list[list[tuple[str, Transform]]], rng: np.random.Generator) -> list[UInt8[Array, "h w"]]:
+    def pictures(
+        self, instants: list[list[tuple[str, Transform]]], rng: np.random.Generator
+    ) -> list[UInt8[Array, "h w"]]:
         """Left and right picture of an exposure; `instants`: what is where in each of its sub-frames."""
         found = []
         for k in range(2):
@@ -124,12 +126,16 @@ class Pair:
             if len(front) == 0:
                 continue
             seen = self._of_body(name, body, hits, front, origins[front], eye.rays[rows[front]])
-            dark = self._dark(seen) | occluded([b for _, b in bodies], seen.points_m, self.projector.translation_m, seen.normals)
+            dark = self._dark(seen) | occluded(
+                [b for _, b in bodies], seen.points_m, self.projector.translation_m, seen.normals
+            )
             nearest[rows[front]] = hits["t_hit"][front]
             light[rows[front]] = self._lit(seen, dark)
         return _binned(light)
 
-    def _of_body(self, name: str, body: Placed, hits: dict[str, Array], rows: Array, origins: Array, rays: Array) -> Seen:
+    def _of_body(
+        self, name: str, body: Placed, hits: dict[str, Array], rows: Array, origins: Array, rays: Array
+    ) -> Seen:
         texels = body.body.mesh.texels_per_m * float(np.median(hits["t_hit"][rows])) / (FOCAL_PX * OVER)
         spot = surface(body, hits, rows, origins, rays, texels)
         return _seen(spot.points_m, spot.normals, spot.albedo, self._finishes[name])
@@ -145,7 +151,11 @@ class Pair:
             if distance <= radius * 1.05:
                 continue
             cosine = np.sqrt(1 - (radius / distance) ** 2)
-            near = stands.hit & (towards @ (center / distance).astype(np.float32) > cosine * far) & (far > distance - radius)
+            near = (
+                stands.hit
+                & (towards @ (center / distance).astype(np.float32) > cosine * far)
+                & (far > distance - radius)
+            )
             rows = np.flatnonzero(near)
             dark = rows[occluded([body], stands.points_m[rows], lamp, stands.normals[rows])]
             light[dark] = self._lit(stands.at(dark), np.ones(len(dark), bool))

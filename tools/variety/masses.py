@@ -10,7 +10,6 @@ from acquisition.synthetic.objects import MassProperties
 from recordings.errors import BadInput
 
 
-
 def of_solid(vertices_m: Float[Array, "v 3"], faces: Int[Array, "f 3"], mass_kg: float) -> MassProperties:
     """Even density inside a closed surface. Raises BadInput where it encloses nothing."""
     import trimesh

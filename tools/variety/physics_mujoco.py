@@ -58,7 +58,7 @@ def _described(body: Thrown, ground: Ground) -> str:
     gravity = " ".join(f"{v:.9g}" for v in ground.gravity_m_s2)
     return f"""
 <mujoco>
-  <option timestep="{STEP_S}" gravity="{gravity}" cone="elliptic" impratio="10" integrator="implicitfast"/>
+  <option timestep="{STEP_S}" gravity="{gravity}" cone="elliptic" impratio="10" integrator="RK4"/>
   <default><geom friction="{ground.friction} 0.0005 {ground.rolling_m}" condim="6" mass="0"
     solref="{-STIFFNESS_S2} {-damping_of(ground.restitution)}" solimp="0.95 0.99 0.001"/></default>
   <asset><mesh name="hull" vertex="{corners}"/></asset>
@@ -87,7 +87,7 @@ def bounced(damping: float) -> float:
     import mujoco
 
     model = mujoco.MjModel.from_xml_string(f"""
-<mujoco><option timestep="{STEP_S}" gravity="0 0 0" integrator="implicitfast"/>
+<mujoco><option timestep="{STEP_S}" gravity="0 0 0" integrator="RK4"/>
   <default><geom solref="{-STIFFNESS_S2} {-damping}" solimp="0.95 0.99 0.001"/></default>
   <worldbody><geom type="plane" size="5 5 0.1"/>
     <body pos="0 0 0.0301"><freejoint/><geom type="sphere" size="0.03" mass="0.1"/></body></worldbody>

@@ -23,7 +23,7 @@ SLOW_M_S = 0.04
 SWEEPS = 25
 SLOP_M = 0.0001
 PUSH_SHARE = 0.08
-"""Of the depth beyond SLOP_M, undone in a step."""
+"""Of the depth beyond SLOP_M, undone in a step by a shift (which gives no speed)."""
 WAVE_NUMBER = 2 * np.pi / 0.6
 
 
@@ -96,15 +96,14 @@ def _contacts(hull, rotation, com, wave):
 
 
 @njit(cache=True)
-def _solve(arms, depth, mass, inverse_world, velocity, spin, friction, restitution, rolling, dt):
+def _solve(arms, mass, inverse_world, velocity, spin, friction, restitution, rolling):
     """Velocity and spin after the impulses of all contacts."""
     n = len(arms)
     wanted, total = np.zeros(n), np.zeros((n, 3))
     for i in range(n):
         approach = velocity[2] + spin[0] * arms[i, 1] - spin[1] * arms[i, 0]
-        wanted[i] = PUSH_SHARE * max(depth[i] - SLOP_M, 0.0) / dt
         if approach < -SLOW_M_S:
-            wanted[i] = max(wanted[i], -restitution * approach)
+            wanted[i] = -restitution * approach
     for _ in range(SWEEPS):
         for i in range(n):
             r = arms[i]
@@ -149,7 +148,8 @@ def _run(hull, mass, inertia, inverse, drag, friction, restitution, rolling, gra
             impact = min(impact, step * dt)
             spin = _spin(rotation, inverse, momentum)
             inverse_world = rotation @ inverse @ rotation.T
-            velocity, spin = _solve(arms, depth, mass, inverse_world, velocity, spin, friction, restitution, rolling, dt)
+            velocity, spin = _solve(arms, mass, inverse_world, velocity, spin, friction, restitution, rolling)
+            com = com + np.array([0.0, 0.0, PUSH_SHARE * max(depth.max() - SLOP_M, 0.0)])
             momentum = rotation @ (inertia @ (rotation.T @ spin))
         com = com + dt * velocity
         half = _turned(rotation, 0.5 * dt * _spin(rotation, inverse, momentum))

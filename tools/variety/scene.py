@@ -19,6 +19,7 @@ from variety.furniture import Item
 from variety.spec import CameraSpec, Spec
 
 AIM_HEIGHT_M = 0.1
+USUAL_M = 0.12
 OBJECT, SCENE, LIGHT, WRONG, MOTION, SENSOR = range(6)
 
 
@@ -63,9 +64,9 @@ class Scene:
 def build(spec: Spec, objects: Path | None = None) -> Scene:
     """The scene of a session; `objects`: a folder of meshes to draw the object from, instead of a family."""
     rng = generator(spec, SCENE)
-    place = world_from_camera(spec.camera)
-    eye = place.translation_m
     tossed = draw_object(spec, objects)
+    place = world_from_camera(spec.camera, float(np.ptp(tossed.hull_m, axis=0).max()))
+    eye = place.translation_m
     standing = furniture.table(spec.table, spec.wrong.table_wave_m, rng)
     standing += furniture.walls(-eye[:2], spec.wall, rng)
     standing += [furniture.clutter(k, eye[:2], rng) for k in range(spec.clutter)]
@@ -94,11 +95,12 @@ def draw_object(spec: Spec, objects: Path | None) -> Tossed:
     return Tossed(Item("object", mesh, appearance.draw_finish(rng)), shapes.supports(mesh.vertices_m), mass)
 
 
-def world_from_camera(camera: CameraSpec) -> Transform:
-    """Looks at a point above the table's middle."""
+def world_from_camera(camera: CameraSpec, longest_m: float) -> Transform:
+    """Looks at a point above the table's middle, from nearer where the object is small, as people do."""
+    distance = max(0.42, camera.distance_m * float(np.clip((longest_m / USUAL_M) ** 0.4, 0.6, 1.2)))
     return look_at(
         CameraConfig(
-            distance_m=camera.distance_m, elevation_deg=camera.elevation_deg, azimuth_deg=camera.azimuth_deg,
+            distance_m=distance, elevation_deg=camera.elevation_deg, azimuth_deg=camera.azimuth_deg,
             aim_height_m=AIM_HEIGHT_M,
         )
     )  # fmt: skip
@@ -119,7 +121,9 @@ def light(count: int, rng: np.random.Generator) -> tuple[tuple[Lamp, ...], Float
         warm = rng.uniform(0, 1)
         rgb = (1.0, 0.97 - 0.22 * warm, 0.95 - 0.5 * warm)
         power = float(rng.uniform(4, 30) * (reach**2 + height**2) / count)
-        lamps.append(Lamp((reach * np.cos(angle), reach * np.sin(angle), height), float(rng.uniform(0.05, 1.0)), power, rgb))
+        lamps.append(
+            Lamp((reach * np.cos(angle), reach * np.sin(angle), height), float(rng.uniform(0.05, 1.0)), power, rgb)
+        )
     around = np.full((64, 128, 3), 0.25, np.float32) * rng.uniform(0.3, 1.2, 3)
     around += 0.5 * rng.random((64, 128, 3)) * rng.uniform(0.0, 1.0)
     for _ in range(int(rng.integers(0, 4))):

@@ -68,7 +68,7 @@ def prism(rng: np.random.Generator) -> Solid:
 
 
 def turned(profile: Float[Array, "n 2"]) -> Solid:
-    """A body of revolution about z. `profile`: radius and height from the lower pole to the upper one, outside first."""
+    """A body of revolution about z. `profile`: radius and height from the lower pole to the upper, outside first."""
     angle = np.linspace(0, 2 * np.pi, SLICES, endpoint=False)
     around = np.stack([np.cos(angle), np.sin(angle)], -1)
     height = np.broadcast_to(profile[:, None, 1:], (len(profile), SLICES, 1))
@@ -187,15 +187,18 @@ def beam(rng: np.random.Generator) -> Solid:
     leg = np.array([thick, other, deep])
     places = {"L": [-1 + thick], "T": [0.0], "U": [-1 + thick, 1 - thick]}[str(rng.choice(["L", "T", "U"]))]
     parts = [foot, *((leg, np.array([x, 0.0, 0.0])) for x in places)]
-    return meshed(joined([rounded_box(h, 0.03, at) for h, at in parts], 0.01), np.array([1.05, other + 0.05, deep + 0.05]))
+    return meshed(
+        joined([rounded_box(h, 0.03, at) for h, at in parts], 0.01), np.array([1.05, other + 0.05, deep + 0.05])
+    )
 
 
 def mug(rng: np.random.Generator) -> Solid:
     """A cup with a round or square handle of random size and place."""
     radius, half, wall = rng.uniform(0.5, 0.75), rng.uniform(0.6, 0.95), rng.uniform(0.05, 0.09)
     top = rng.uniform(0.85, 1.15)
-    shell, hollow = cylinder(radius, half, np.zeros(3), top), cylinder(
-        radius - wall, half, np.array([0.0, 0.0, wall]), top
+    shell, hollow = (
+        cylinder(radius, half, np.zeros(3), top),
+        cylinder(radius - wall, half, np.array([0.0, 0.0, wall]), top),
     )
     reach, tall, tube = rng.uniform(0.25, 0.45), rng.uniform(0.35, 0.6) * half, rng.uniform(0.05, 0.09)
     power = float(rng.choice([2.0, 6.0]))

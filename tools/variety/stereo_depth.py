@@ -65,7 +65,8 @@ def _semi_global(left: UInt8[Array, "h w"], right: UInt8[Array, "h w"], preset: 
     area = preset.block**2
     matcher = cv2.StereoSGBM_create(
         minDisparity=0, numDisparities=DISPARITIES, blockSize=preset.block, P1=2 * area, P2=16 * area,
-        disp12MaxDiff=-1, preFilterCap=31, uniquenessRatio=preset.uniqueness_percent, mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
+        disp12MaxDiff=-1, preFilterCap=31, uniquenessRatio=preset.uniqueness_percent,
+        mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
     )  # fmt: skip
     # the matcher leaves a band of its search range at the left: a wider picture gives it back
     wide = [cv2.copyMakeBorder(image, 0, 0, DISPARITIES, 0, cv2.BORDER_REPLICATE) for image in (left, right)]
@@ -162,5 +163,3 @@ def _splatted(low, high, z, height, width):
 def in_units(depth_m: Float32[Array, "h w"], unit_m: float) -> UInt16[Array, "h w"]:
     """As the file has it; 0 where there is none."""
     return np.clip(np.round(depth_m / unit_m), 0, 65535).astype(np.uint16)
-
-

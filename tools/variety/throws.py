@@ -27,6 +27,8 @@ STEP_S = 0.001
 LONGEST_FREE_S = 1.8
 NEAREST_M = 0.28
 LOWEST_HELD_M = 0.015
+SEEN_FREE_S = 0.25
+"""At least so long an object that rolls out of view is seen after its release."""
 
 Place = Callable[[float], Transform | None]
 """world_from_item at a time; None: not there."""
@@ -94,15 +96,17 @@ class Thrower:
         rng: np.random.Generator,
     ) -> Throw | None:  # fmt: skip
         seen = self._seen(fall.path)
-        rolls = kind == "rolls out"
-        if not np.isfinite(fall.impact_s) or (seen.all() == rolls) or (rolls and not seen[: LOOKS // 3].all()):
-            return None
-        if not rolls and not self._on_table(fall.path):
+        if not np.isfinite(fall.impact_s):
             return None
         end = float(fall.path.times_s[-1])
-        rest = fall.rest_s if np.isfinite(fall.rest_s) else end
-        if not rolls and rest - told[1] > LONGEST_FREE_S:
+        if kind == "rolls out":
+            gone = float(np.linspace(told[1], end, LOOKS)[int(np.argmin(seen))])
+            if seen.all() or gone < told[1] + SEEN_FREE_S:
+                return None
+            end = min(end, gone + after_s)
+        elif not seen.all() or not self._on_table(fall.path):
             return None
+        rest = min(fall.rest_s, end)
         instants = Instants(told[0], told[1], fall.impact_s, rest, min(end, rest + after_s))
         path = before.joined(fall.path)
         return Throw(number, kind, path, instants, self._others(path, instants, kind, rng))
@@ -135,7 +139,7 @@ class Thrower:
         flight_s = (upward + np.sqrt(upward**2 + 2 * GRAVITY_M_S2 * (height - 0.6 * self.half_m))) / GRAVITY_M_S2
         slide_m = 0.4 * forward**2 / (2 * GRAVITY_M_S2 * max(self.ground.friction, 0.1))
         target = np.array([*rng.normal(0, 0.05, 2), height])
-        start = target - direction * (0.6 if rolls else 1.0) * (forward * flight_s + slide_m)
+        start = target - direction * (0.15 if rolls else forward * flight_s + slide_m)
         spin = self.spec.spin_rad_s * rng.uniform(0.6, 1.2) * _unit(rng.standard_normal(3))
         turn = rotation_exp(rng.uniform(0, np.pi) * _unit(rng.standard_normal(3)))
         return Release(Transform("world", "object", turn, start), forward * direction + [0, 0, upward], spin)
@@ -204,7 +208,9 @@ def _moved(path: Trajectory, to: Transform, within_s: float) -> Trajectory:
     position = begin.translation_m + share[:, None] * (to.translation_m - begin.translation_m)
     velocity = np.gradient(position, STEP_S, axis=0)
     spin = np.gradient(share, STEP_S)[:, None] * turn
-    return Trajectory(start_s + times, position, np.array([quaternion_from_rotation(r) for r in rotations]), velocity, spin)
+    return Trajectory(
+        start_s + times, position, np.array([quaternion_from_rotation(r) for r in rotations]), velocity, spin
+    )
 
 
 def _holding(path: Trajectory, release_s: float, reach: Transform, stays: bool) -> Place:

@@ -1,0 +1,180 @@
+"""Bad presets and bad meshes are named; a session is whole, or nothing is left."""
+
+import argparse
+import importlib.util
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import trimesh
+from variety import colour, scene, seeds, session, spec, throws
+from variety.mesh_files import read_textured, textured_mesh
+
+from recordings.errors import BadInput
+
+ROOT = Path(__file__).resolve().parents[3]
+CASE = seeds.Case("choose", 9, 0)
+BLENDER = pytest.mark.skipif(
+    not (colour.OWN_PYTHON.exists() or __import__("os").environ.get("VARIETY_BLENDER")),
+    reason="no Blender: make blender",
+)
+
+
+def small(**changed):
+    """A session of one short toss, quick to make."""
+    drawn = spec.draw(CASE, 1)
+    camera = replace(drawn.camera, width=424, height=240, focal_px=390.0, center_off_px=(0.0, 0.0), dropped=0.0)
+    return replace(drawn, tosses=("good",), camera=camera, clutter=0, table="mat", holder="none", occluder="none",
+                   person=False, **changed)  # fmt: skip
+
+
+def textured_cube(folder, scale=1.0, texture=True, open_=False):
+    """An .obj of a 10 cm cube with a picture, or one fault of it."""
+    box = trimesh.creation.box((0.1 * scale,) * 3)
+    faces = box.faces[:-1] if open_ else box.faces
+    lines = ["mtllib cube.mtl", "usemtl skin", *("v {} {} {}".format(*v) for v in box.vertices)]
+    lines += ["vt 0.1 0.1", "vt 0.9 0.1", "vt 0.9 0.9"] if texture else []
+    lines += ["f " + " ".join(f"{v + 1}/{k + 1}" if texture else f"{v + 1}" for k, v in enumerate(f)) for f in faces]
+    (folder / "cube.obj").write_text("\n".join(lines) + "\n")
+    (folder / "cube.mtl").write_text("newmtl skin\nKd 1 1 1\n" + ("map_Kd skin.png\n" if texture else ""))
+    cv2.imwrite(str(folder / "skin.png"), np.full((32, 32, 3), (40, 80, 200), np.uint8))
+    return folder / "cube.obj"
+
+
+def test_a_good_mesh_keeps_its_size_and_its_picture(tmp_path):
+    mesh = read_textured(textured_cube(tmp_path))
+    np.testing.assert_allclose(np.ptp(mesh.vertices_m, axis=0), 0.1, rtol=1e-6)
+    np.testing.assert_allclose(mesh.atlas[16, 16], [0.578, 0.080, 0.021], atol=2e-3)  # sRGB 200, 80, 40 in linear light
+
+
+def test_a_mesh_without_texture_is_named(tmp_path):
+    with pytest.raises(BadInput, match=r"cube\.obj has no texture"):
+        textured_mesh_of(textured_cube(tmp_path, texture=False))
+
+
+def test_a_mesh_that_is_not_closed_is_named(tmp_path):
+    with pytest.raises(BadInput, match=r"cube\.obj is not closed"):
+        textured_mesh_of(textured_cube(tmp_path, open_=True))
+
+
+def test_a_mesh_in_millimetres_is_named_with_the_remedy(tmp_path):
+    with pytest.raises(BadInput, match=r"cube\.obj is 100 m long.*in millimetres: scale it by 0\.001"):
+        textured_mesh_of(textured_cube(tmp_path, scale=1000.0))
+
+
+def textured_mesh_of(path):
+    return textured_mesh(path.parent, np.random.default_rng(0))
+
+
+def test_a_folder_without_meshes_is_named(tmp_path):
+    with pytest.raises(BadInput, match="holds no mesh"):
+        textured_mesh(tmp_path, np.random.default_rng(0))
+
+
+def test_a_preset_that_puts_the_object_out_of_view_is_named(monkeypatch):
+    monkeypatch.setattr(throws, "TRIES", 6)
+    far = small()
+    away = replace(far, camera=replace(far.camera, focal_px=3000.0))
+    with pytest.raises(BadInput, match=r"choose-009, toss 0 \(good\): in none of 6 draws"):
+        throws.Thrower(away, scene.build(away)).throw(0)
+
+
+def test_a_good_toss_is_in_view_all_the_time_and_one_that_rolls_out_is_not_at_its_end():
+    drawn = small()
+    built = scene.build(drawn)
+    thrown = throws.Thrower(drawn, built).throw(0)
+    rolling = replace(drawn, tosses=("rolls out",), friction=0.06, table="wood")
+    gone = throws.Thrower(rolling, built).throw(0)
+    assert seen(built, thrown).all()
+    assert seen(built, gone)[0]
+    assert not seen(built, gone)[-1]
+
+
+def seen(built, thrown):
+    found = []
+    for t in np.linspace(0, thrown.instants.end_s, 25):
+        local = built.world_from_camera.inverse().points(thrown.object.at(t).points(built.tossed.hull_m))
+        found.append(bool(built.camera.sees(built.camera.project(local)).all()))
+    return np.array(found)
+
+
+def test_an_object_dropped_twice_falls_lies_is_lifted_and_falls_again():
+    drawn = replace(small(), tosses=("twice",))
+    thrown = throws.Thrower(drawn, scene.build(drawn)).throw(0)
+    height = np.array([thrown.object.at(t).translation_m[2] for t in np.linspace(0, thrown.instants.end_s, 200)])
+    lowest = int(height[: int(200 * thrown.instants.lead_in_s / thrown.instants.end_s)].argmin())
+    assert height[lowest] < height[0] - 0.01
+    assert height[lowest:].max() > height[lowest] + 0.08
+    assert height[-1] < height[lowest:].max() - 0.08
+
+
+def bench():
+    told = importlib.util.spec_from_file_location("bench_variety", ROOT / "tools" / "bench_variety.py")
+    module = importlib.util.module_from_spec(told)
+    told.loader.exec_module(module)
+    return module
+
+
+ASKED = argparse.Namespace(tosses=1, objects=None, variant="ours", threads=1)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "named"),
+    [(BadInput("object out of view"), "skipped: object out of view"), (ValueError("odd"), "crashed: ValueError: odd")],
+)
+def test_a_session_that_cannot_be_made_is_a_row_with_its_reason_and_leaves_nothing(monkeypatch, tmp_path, wrong, named):
+    program = bench()
+
+    def fail(*_):
+        raise wrong
+
+    monkeypatch.setattr(program.session, "make", fail)
+    row = program.run_case(CASE, tmp_path / "work", ASKED)
+    assert row["failed"].startswith(named)
+    assert row["case"] == "choose-009"
+    assert not (tmp_path / "work").exists()
+    json.dumps(row)
+
+
+def test_a_case_is_found_by_its_name_and_nonsense_is_refused():
+    program = bench()
+    assert program.case_of("judge-007-1") == seeds.Case("judge", 7, 1)
+    with pytest.raises(BadInput, match="wanted for example choose-003"):
+        program.case_of("7")
+
+
+def test_without_blender_it_is_said_how_to_get_it(monkeypatch, tmp_path):
+    monkeypatch.setenv("VARIETY_BLENDER", str(tmp_path / "none"))
+    with pytest.raises(BadInput, match="make blender"):
+        colour.blender()
+
+
+@pytest.mark.slow
+@BLENDER
+def test_a_session_is_whole_and_the_picture_the_depth_and_the_mask_agree(tmp_path):
+    """Path tracer, stereo matcher and ray caster see the object at the same place; the depth there is the object's."""
+    drawn = small(wall=True)
+    drawn = replace(drawn, wrong=replace(drawn.wrong, depth_scale=1.0, depth_delay_s=0.0, delay_known=False),
+                    camera=replace(drawn.camera, readout_s=0.0, jpeg=95, blur_px=0.0))  # fmt: skip
+    out = tmp_path / "one"
+    truth = session.make(drawn, out, threads=2)
+    poses = np.load(truth / "toss_00" / "poses_camera_object.npz")
+    frames = sorted((out / "toss_00" / "rgb").glob("*.jpg"))
+    assert len(frames) == len(poses["t"]) == len(sorted((out / "toss_00" / "depth").glob("*.png")))
+    first, last = (cv2.imread(str(p)).astype(float) for p in (frames[0], frames[-1]))
+    masks = [cv2.imread(str(truth / "toss_00" / "masks" / f"{k:06d}.png"), 0) > 0 for k in (0, len(frames) - 1)]
+    change = cv2.GaussianBlur(np.abs(first - last).max(axis=-1), (0, 0), 1.0)
+    either, still = (
+        masks[0] | masks[1],
+        ~cv2.dilate((masks[0] | masks[1]).astype(np.uint8), np.ones((25, 25))).astype(bool),
+    )
+    assert np.median(change[either]) > 3 * np.median(change[still])
+    depth = cv2.imread(str(out / "toss_00" / "depth" / "000000.png"), -1) * drawn.depth.unit_m
+    inner = cv2.erode(masks[0].astype(np.uint8), np.ones((5, 5))).astype(bool) & (depth > 0)
+    expected = float(poses["T_camera_object"][0][2, 3])
+    assert np.median(depth[inner]) == pytest.approx(expected, abs=0.06)
+    shutil.rmtree(out)

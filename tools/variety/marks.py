@@ -1,0 +1,177 @@
+"""What a processed session is worth: pose scores, wrong frames that were not flagged, covariances, shape, friction."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+from numpy import ndarray as Array
+
+from processing.metrics import align_first
+from processing.score import Value, chamfers, score_variant, true_mesh
+from processing.truth import Truth, open_truth
+from recordings.geometry import nearest_rotation, rotation_log
+from recordings.results import Results, VariantRecord
+from recordings.session import Session
+from recordings.tracks import ObjectTrack
+
+WRONG_DEG, WRONG_M = 5.0, 0.02
+CHI2_6_95 = 12.592
+"""95 % of a chi-squared variable of six degrees of freedom."""
+TURNED = ("can", "bottle", "bowl")
+"""Bodies of revolution about their z; plain ones show no turn about it."""
+
+
+@dataclass(frozen=True)
+class Marks:
+    """Of one session and one tracker. `add`, `adds`, `success` in percent; Chamfer in cm; `nees` a mean over six
+    degrees of freedom (1: as claimed); None where there is nothing to judge."""
+
+    frames: int
+    lost: int
+    flagged: int
+    silent: int
+    silent_tosses: int
+    add: float
+    adds: float
+    success: float
+    chamfer_cm: float | None
+    inside_95: float | None
+    nees: float | None
+    friction: float | None
+    friction_inside: bool | None
+
+
+def read_marks(results_path: Path, session_path: Path, truth_path: Path) -> Marks:
+    """Marks of the one variant in a results folder."""
+    results, session = Results.open(results_path), Session.open(session_path)
+    try:
+        record = results.find()
+        truth = open_truth(truth_path, session, record.calibration)
+        assert truth is not None
+        return _marks(results, record, truth, json.loads((truth_path / "spec.json").read_text()))
+    finally:
+        session.close()
+
+
+def _marks(results: Results, record: VariantRecord, truth: Truth, spec: Mapping[str, Any]) -> Marks:
+    scored = score_variant(results, record, truth)
+    tracks = results.tracks(record.name, record.scope)
+    round_body = spec["family"] in TURNED and spec["surface"] == "plain"
+    wrong, tracked, frames, errors, tosses = 0, 0, 0, [], 0
+    for track in tracks.values():
+        true = truth.camera_from_object(track)
+        if true is None:
+            continue
+        silent = silent_wrong(track, true, round_body)
+        wrong, frames = wrong + int(silent.sum()), frames + len(silent)
+        tosses += bool(silent.any())
+        tracked += sum(s == "tracked" for s in track.status)
+        errors.append(normalised_errors(track, true))
+    nees = np.concatenate(errors) if errors else np.zeros(0)
+    model = results.contact(record.name, record.scope) if record.contact else None
+    inside = None
+    if model is not None and truth.friction is not None:
+        inside = bool(model.friction_low <= truth.friction <= model.friction_high)
+    value = scored.values
+    return Marks(
+        frames, sum(int(t.lost.sum()) for t in tracks.values()), frames - tracked, wrong, tosses,
+        _of(value, "add_auc") or 0.0, _of(value, "adds_auc") or 0.0, _of(value, "success_5deg_5cm") or 0.0,
+        _of(value, "cd_icp"), float((nees < CHI2_6_95).mean()) if len(nees) else None,
+        float(nees.mean() / 6) if len(nees) else None, None if model is None else model.friction, inside,
+    )  # fmt: skip
+
+
+def _of(values: Mapping[str, Value], name: str) -> float | None:
+    return values[name].value if name in values and np.isfinite(values[name].value) else None
+
+
+def silent_wrong(track: ObjectTrack, true: Float[Array, "n 4 4"], round_body: bool) -> Bool[Array, " n"]:
+    """Frames called tracked that are off by more than WRONG_DEG or WRONG_M, each toss aligned at its first frame.
+    Of a plain body of revolution only the direction of its axis is judged."""
+    out = np.zeros(len(track.status), dtype=bool)
+    shift = align_first(track.camera_from_object, true)
+    if shift is None:
+        return out
+    for k, status in enumerate(track.status):
+        if status != "tracked" or not np.isfinite(true[k]).all():
+            continue
+        found = track.camera_from_object[k] @ shift
+        if round_body:
+            cosine = float(np.clip(found[:3, 2] @ true[k][:3, 2], -1, 1))
+            angle = np.degrees(np.arccos(cosine))
+        else:
+            angle = np.degrees(np.linalg.norm(rotation_log(nearest_rotation(found[:3, :3] @ true[k][:3, :3].T))))
+        out[k] = angle > WRONG_DEG or np.linalg.norm(found[:3, 3] - true[k][:3, 3]) > WRONG_M
+    return out
+
+
+def normalised_errors(track: ObjectTrack, true: Float[Array, "n 4 4"]) -> Float[Array, " m"]:
+    """e^T C^-1 e of the tracked frames with a covariance: rotation vector and shift in camera axes. The object frame,
+    which nobody knows, is that which fits all of the toss's tracked frames best (mean rotation, median shift)."""
+    rows = [
+        k for k, s in enumerate(track.status)
+        if s == "tracked" and np.isfinite(true[k]).all() and np.isfinite(track.covariance[k]).all()
+    ]  # fmt: skip
+    if len(rows) < 2:
+        return np.zeros(0)
+    shifts = np.array([np.linalg.inv(true[k]) @ track.camera_from_object[k] for k in rows])
+    best = np.eye(4)
+    best[:3, :3] = nearest_rotation(shifts[:, :3, :3].mean(axis=0))
+    best[:3, 3] = np.median(shifts[:, :3, 3], axis=0)
+    out = []
+    for k in rows:
+        found, wanted = track.camera_from_object[k], true[k] @ best
+        e = np.append(rotation_log(nearest_rotation(found[:3, :3] @ wanted[:3, :3].T)), found[:3, 3] - wanted[:3, 3])
+        spread = track.covariance[k] + 1e-12 * np.eye(6)
+        out.append(float(e @ np.linalg.solve(spread, e)))
+    return np.array(out)
+
+
+def fusion_floor_cm(session_path: Path, truth_path: Path, place: Path) -> float | None:
+    """Chamfer distance of what all tosses show, fused at the true poses within the true masks: no estimate of a pose
+    or mask is in it. None where nothing can be fused."""
+    from processing.config import Config
+    from processing.field.fuse import fuse
+    from processing.field.learn import TossViews, chosen_views
+    from processing.field.mesh import grid_mesh
+    from processing.pipeline import start_run
+    from recordings.errors import BadInput
+    from recordings.progress import Silent
+
+    session = Session.open(session_path)
+    try:
+        run = start_run(session, session.tosses, place, Config(), "multi-hypothesis", lambda _: Silent())
+        truth = open_truth(truth_path, session, session.calibration)
+        mesh = None if truth is None else true_mesh(truth)
+        if truth is None or mesh is None:
+            return None
+        tosses = []
+        for number in session.tosses:
+            frames = run.frames(number)
+            track = _known(ObjectTrack.nowhere(number, run.camera.frame, frames.times_ns), truth)
+            tosses.append(TossViews(frames, frames.depth_times_ns, _masks(truth_path / f"toss_{number:02d}"), track))
+        views = chosen_views(tosses, run.camera, run.config.shape)
+        return chamfers(grid_mesh(fuse(views, run.config.shape.field.fuse)), np.eye(4), mesh).fitted.cm
+    except BadInput:
+        return None
+    finally:
+        session.close()
+
+
+def _known(track: ObjectTrack, truth: Truth) -> ObjectTrack:
+    poses = truth.camera_from_object(track)
+    assert poses is not None
+    status = tuple("tracked" if np.isfinite(p).all() else "lost" for p in poses)
+    return replace(track, camera_from_object=poses, status=status)  # type: ignore[arg-type]
+
+
+def _masks(folder: Path) -> list[Bool[Array, "h w"]]:
+    import cv2
+
+    return [cv2.imread(str(p), cv2.IMREAD_GRAYSCALE) > 0 for p in sorted((folder / "masks").glob("*.png"))]
