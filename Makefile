@@ -7,7 +7,7 @@ OUT := out/demo
 SAMPLE := recordings/samples/box_toss
 EXTRAS := dev,sim,learned,rig-realsense,rig-franka,rig-ur
 
-.PHONY: setup demo test test-all check bench
+.PHONY: setup demo test test-all check bench blender variety
 
 setup: $(STAMP)
 
@@ -44,4 +44,17 @@ check: $(STAMP)
 	$(BIN)/python tools/check.py
 
 bench: $(STAMP)
-	for bench in tools/bench_*.py; do echo "== $$bench"; $(BIN)/python $$bench || exit 1; done
+	for bench in $(filter-out tools/bench_variety.py,$(wildcard tools/bench_*.py)); do echo "== $$bench"; $(BIN)/python $$bench || exit 1; done
+
+# Blender's Python package pins another numpy and is under the GPL: it lives beside .venv, only tools/variety runs it.
+blender: .venv-blender/.installed
+
+.venv-blender/.installed: tools/variety/blender.txt
+	@command -v python3.11 >/dev/null || { echo "no Python 3.11 found, which bpy 4.5 needs: apt-get install -y python3.11-venv" >&2; exit 1; }
+	test -x .venv-blender/bin/python || python3.11 -m venv .venv-blender
+	.venv-blender/bin/python -m pip install -q -r tools/variety/blender.txt
+	touch $@
+
+# The judge table: 60 sessions made, processed by two trackers, scored, deleted. Hours; goes on where it was stopped.
+variety: $(STAMP) blender
+	$(BIN)/python tools/bench_variety.py --split judge --n 60 --resume

@@ -1,6 +1,7 @@
-"""CPU seconds of the synthetic lab, per frame, against what it must keep to so that variety can be made in minutes.
+"""CPU seconds of the synthetic lab, per frame, against what it must keep to so that variety can be made in minutes;
+then its parametric depth and the stereo-matched depth of tools/variety beside each other and beside what is published.
 
-python tools/bench_synthetic.py
+python tools/bench_synthetic.py            # --depth: only the second table
 """
 
 from __future__ import annotations
@@ -10,6 +11,8 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+
+from variety import depth_check
 
 from acquisition.synthetic.config import MonoConfig
 from acquisition.synthetic.lab import Lab
@@ -65,6 +68,21 @@ def rows() -> list[Row]:
 
 
 def main() -> int:
+    if "--depth" not in sys.argv[1:]:
+        return max(times(), depths())
+    return depths()
+
+
+def depths() -> int:
+    """Both depth models before a flat wall and a block."""
+    print("| depth | parametric | stereo-matched | D455, published |\n|---|---|---|---|")
+    for row in depth_check.rows():
+        print("| " + " | ".join(row) + " |")
+    return 0
+
+
+def times() -> int:
+    """CPU seconds; 1 where one is above its limit."""
     table = rows()
     print("| what | CPU s | at most |\n|---|---|---|")
     for row in table:

@@ -109,7 +109,7 @@ def _bench(given: argparse.Namespace) -> int:
     for case in wanted:
         path = rows_folder / f"{case.name}.json"
         if not path.exists():
-            row = run_case(case, out / "work", given)
+            row = run_case(case, out / "work" / case.name, given)
             path.with_suffix(".part").write_text(json.dumps(row, indent=1) + "\n")
             path.with_suffix(".part").rename(path)
             print(f"{case.name}: {row.get('failed') or 'done'}", file=sys.stderr, flush=True)

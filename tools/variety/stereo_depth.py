@@ -37,9 +37,9 @@ class Preset:
 
 
 PRESETS = {
-    "default": Preset(7, 8, 1.0, 60, 0.8, False),
-    "high-accuracy": Preset(7, 18, 0.6, 150, 1.6, False),
-    "high-density": Preset(9, 2, 2.0, 20, 0.3, True),
+    "default": Preset(9, 8, 1.0, 60, 0.7, False),
+    "high-accuracy": Preset(9, 18, 0.6, 150, 1.4, False),
+    "high-density": Preset(11, 2, 2.0, 20, 0.3, True),
 }
 
 
