@@ -10,17 +10,18 @@ import numpy as np
 from jaxtyping import Float, Float32
 from numpy import ndarray as Array
 
+from acquisition.synthetic.arm import Arm
 from acquisition.synthetic.cameras import look_at
 from acquisition.synthetic.config import CameraConfig
 from acquisition.synthetic.objects import MassProperties
 from recordings.geometry import CameraModel, Transform
-from variety import appearance, furniture, masses, shapes
+from variety import appearance, arms, furniture, masses, shapes
 from variety.furniture import Item
 from variety.spec import CameraSpec, Spec
 
 AIM_HEIGHT_M = 0.1
 USUAL_M = 0.12
-OBJECT, SCENE, LIGHT, WRONG, MOTION, SENSOR = range(6)
+OBJECT, SCENE, LIGHT, WRONG, MOTION, SENSOR, ARM = range(7)
 
 
 def generator(spec: Spec, *purpose: int) -> np.random.Generator:
@@ -54,6 +55,7 @@ class Scene:
     tossed: Tossed
     standing: tuple[Item, ...]
     holder: Item | None
+    arm: Arm | None
     person: Item | None
     lamps: tuple[Lamp, ...]
     surroundings: Float32[Array, "h w 3"]
@@ -77,9 +79,14 @@ def build(spec: Spec, objects: Path | None = None) -> Scene:
     needs_hand = spec.holder == "none" and (spec.occluder == "passing" or "hand stays" in spec.tosses)
     holder = "hand" if needs_hand else spec.holder
     held = holders[holder](min(width, 0.06), rng) if holder in holders else None
+    arm = None
+    if spec.arm:
+        arm = arms.arm_of(tossed.hull_m, -eye[:2], spec.wrong.arm_clock_s, generator(spec, ARM))
     walking = furniture.person(rng) if spec.person else None
     lamps, around = light(spec.lamps, generator(spec, LIGHT))
-    return Scene(tossed, tuple(standing), held, walking, lamps, around, place, camera_model(spec.camera))
+    return Scene(
+        tossed, tuple(standing), None if arm else held, arm, walking, lamps, around, place, camera_model(spec.camera)
+    )
 
 
 def draw_object(spec: Spec, objects: Path | None) -> Tossed:

@@ -103,7 +103,7 @@ class Sight:
             ]
             front = found < nearest
             owner[front], nearest[front] = (
-                (1 if name == "object" else 2 if name in ("hand", "passer") else 3),
+                (1 if name == "object" else 3 if name == "person" else 2),
                 found[front],
             )
             whole = int(np.isfinite(found).sum()) if name == "object" else whole
@@ -127,7 +127,7 @@ def _toss(made: Made, throw: Throw, times: Float[Array, " n"]) -> None:
         mask, hand, visible = made.sight.masks(_placed(throw, t + _row_delay(made, throw, t)))
         shares.append(visible)
         _png(there / "masks" / f"{k:06d}.png", 255 * mask.astype(np.uint8))
-        if throw.others.keys() & {"hand", "passer"}:
+        if throw.others.keys() - {"person"}:
             _png(there / "robot_masks" / f"{k:06d}.png", 255 * hand.astype(np.uint8))
         if k == 0:
             if mask.sum() < 30:
@@ -138,6 +138,8 @@ def _toss(made: Made, throw: Throw, times: Float[Array, " n"]) -> None:
     _times(here / "timestamps.txt", times)
     if spec.wrong.delay_known:
         _times(here / "depth_timestamps.txt", times + delay)
+    if throw.swing is not None and made.scene.arm is not None:
+        _arm(here / "arm.csv", made.scene.arm.states(throw.swing, float(times[-1]) + 0.02, rng))
     told = {"frames": len(times)} | ({"release_time_s": throw.instants.release_s} if spec.say_release else {})
     _json(here / "toss.json", told)
     _truth_of(made, throw, there, times, shares)
@@ -199,10 +201,24 @@ def believed(spec: Spec, scene: Scene) -> tuple[CameraModel, Transform]:
     return camera, scene.world_from_camera @ small_error("d455", wrong.camera_m, wrong.camera_deg, rng)
 
 
+def believed_base(spec: Spec, scene: Scene) -> Transform:
+    """world_from_base as the session says it: the hand-eye calibration is off."""
+    assert scene.arm is not None
+    wrong, rng = spec.wrong, generator(spec, WRONG, 1)
+    return scene.arm.world_from_base @ small_error(scene.arm.robot.root, wrong.hand_eye_m, wrong.hand_eye_deg, rng)
+
+
 def _session_files(made: Made, ground: Ground) -> None:
     spec, scene = made.spec, made.scene
     camera, place = believed(spec, scene)
-    _json(made.out / "session.json", {
+    arm = {}
+    if scene.arm is not None:
+        arm = {"arm": "franka_panda", "T_world_base": believed_base(spec, scene).matrix.tolist()}
+        _json(made.truth / "calibration.json", {
+            "T_world_base": scene.arm.world_from_base.matrix.tolist(),
+            "T_world_d455": scene.world_from_camera.matrix.tolist(), "arm_clock_offset_s": spec.wrong.arm_clock_s,
+        })  # fmt: skip
+    _json(made.out / "session.json", arm | {
         "object": spec.name,
         "camera": {
             "model": "D455-like", "K": camera.K.tolist(), "distortion": list(camera.distortion), "fps": FPS,
@@ -247,6 +263,12 @@ def _write_mesh(made: Made) -> None:
         "f " + " ".join(f"{v + 1}/{3 * k + i + 1}" for i, v in enumerate(face)) for k, face in enumerate(mesh.faces)
     ]
     (made.truth / "mesh.obj").write_text("\n".join(lines) + "\n")
+
+
+def _arm(path: Path, states: Float[Array, "n 16"]) -> None:
+    """As the folder layout wants it: seconds, radians, radians a second, metres."""
+    names = ["time_s", *(f"q{k}" for k in range(1, 8)), *(f"dq{k}" for k in range(1, 8)), "finger_width_m"]
+    np.savetxt(path, states, fmt="%.6f", delimiter=",", header=",".join(names), comments="")
 
 
 def _truth_of(made: Made, throw: Throw, there: Path, times: Float[Array, " n"], visible: Sequence[float]) -> None:

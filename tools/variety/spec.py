@@ -20,6 +20,7 @@ VIEW_DEG = (42.0, 88.0)
 """Horizontal field of view of RealSense colour cameras, crops included."""
 TABLES = ("cloth", "wood", "steel", "towel", "mat")
 TOSSES = (1, 2, 2, 3, 3, 3, 4, 4, 5, 6, 8, 12)
+ARM_SHARE = 0.2
 BAD = ("twice", "rolls out", "hand stays")
 
 
@@ -102,6 +103,8 @@ class Spec:
     lamps: int
     wall: bool
     say_release: bool
+    arm: bool
+    """A Panda tosses, where its hand can close on the object (then there is no other holder and no bad toss)."""
     camera: CameraSpec
     depth: DepthSpec
     wrong: Wrong
@@ -122,9 +125,14 @@ def draw(case: Case, tosses: int | None = None) -> Spec:
         float(rng.uniform(0.4, 1.2)), float(rng.uniform(0.0, 25.0)), kinds, str(rng.choice(TABLES)),
         str(rng.choice(["none", "none", "hand", "hand", "gripper"])), int(rng.integers(0, 9)),
         bool(rng.random() < 0.12), str(rng.choice(["none"] * 8 + ["standing", "passing"])), int(rng.integers(1, 6)),
-        bool(rng.random() < 0.75), bool(rng.random() < 0.7), _camera(rng), _depth(rng), _wrong(rng),
+        bool(rng.random() < 0.75), bool(rng.random() < 0.7), _arm_tosses(case),
+        _camera(rng), _depth(rng), _wrong(rng),
     )  # fmt: skip
     return spec if tosses is None else replace(spec, tosses=spec.tosses[:tosses])
+
+
+def _arm_tosses(case: Case) -> bool:
+    return bool(np.random.default_rng([case.seed, 1]).random() < ARM_SHARE)
 
 
 def _camera(rng: np.random.Generator) -> CameraSpec:

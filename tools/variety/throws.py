@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray as Array
 
+from acquisition.synthetic.arm import Swing
 from acquisition.synthetic.motion import Instants, Release, Trajectory, unseen_hand
 from recordings.errors import BadInput
 from recordings.geometry import Transform, quaternion_from_rotation, rotation_exp, rotation_log
+from variety import arms
 from variety.furniture import PATCH_HALF_M, Item
 from variety.physics import Engine, Fall, Ground, Thrown
 from variety.physics_mujoco import MuJoCo
@@ -43,6 +46,8 @@ class Throw:
     object: Trajectory
     instants: Instants
     others: dict[str, Place]
+    swing: Swing | None = None
+    """Of the arm, where one tosses."""
 
 
 def ground_of(spec: Spec) -> Ground:
@@ -70,7 +75,7 @@ class Thrower:
         self.half_m = 0.5 * float(np.linalg.norm(extent))
 
     def throw(self, number: int) -> Throw:
-        kind = self.spec.tosses[number]
+        kind = "good" if self.scene.arm is not None else self.spec.tosses[number]
         rng = generator(self.spec, MOTION, number)
         for attempt in range(TRIES):
             calm = 1 - 0.75 * attempt / TRIES
@@ -85,11 +90,29 @@ class Thrower:
     def _once(self, number: int, kind: str, calm: float, rng: np.random.Generator) -> Throw | None:
         release = self._release(kind, calm, rng)
         hold_s, lead_s, after_s = rng.uniform(0.2, 0.35), rng.uniform(0.14, 0.26), rng.uniform(0.15, 0.35)
+        if self.scene.arm is not None:
+            return self._by_arm(number, release, hold_s, after_s, rng)
         before = unseen_hand(release, hold_s, lead_s, STEP_S)
         if not self._held_well(before):
             return None
         fall = self.engine.drop(self.body, self.ground, release, hold_s + lead_s, LONGEST_FREE_S, after_s)
         return self._accepted(number, kind, before, fall, (hold_s, hold_s + lead_s), after_s, rng)
+
+    def _by_arm(
+        self, number: int, wanted: Release, hold_s: float, after_s: float, rng: np.random.Generator
+    ) -> Throw | None:
+        assert self.scene.arm is not None
+        found = arms.carried(self.scene.arm, wanted, hold_s, rng)
+        if found is None or not self._held_well(found[0]):
+            return None
+        before, release, swing, free_s = found
+        fall = self.engine.drop(self.body, self.ground, release, free_s, LONGEST_FREE_S, after_s)
+        thrown = self._accepted(number, "good", before, fall, (hold_s, swing.release_s), after_s, rng)
+        if thrown is None:
+            return None
+        links = arms.Links(self.scene.arm, swing)
+        by_arm = {arms.name_of(k): partial(links.place, k) for k in range(len(self.scene.arm.bodies))}
+        return replace(thrown, others=thrown.others | by_arm, swing=swing)
 
     def _accepted(
         self, number: int, kind: str, before: Trajectory, fall: Fall, told: tuple[float, float], after_s: float,
@@ -264,4 +287,4 @@ def moving_items(scene: Scene) -> dict[str, Item]:
         found |= {"hand": scene.holder, "passer": scene.holder}
     if scene.person is not None:
         found["person"] = scene.person
-    return found
+    return found if scene.arm is None else found | arms.items(scene.arm)

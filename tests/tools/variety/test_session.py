@@ -11,10 +11,11 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
-from variety import colour, scene, seeds, session, spec, throws
+from variety import arms, colour, scene, seeds, session, spec, throws
 from variety.mesh_files import read_textured, textured_mesh
 
 from recordings.errors import BadInput
+from recordings.geometry import rotation_angle_rad
 
 ROOT = Path(__file__).resolve().parents[3]
 CASE = seeds.Case("choose", 9, 0)
@@ -178,3 +179,43 @@ def test_a_session_is_whole_and_the_picture_the_depth_and_the_mask_agree(tmp_pat
     expected = float(poses["T_camera_object"][0][2, 3])
     assert np.median(depth[inner]) == pytest.approx(expected, abs=0.06)
     shutil.rmtree(out)
+
+
+def armed():
+    """A session of a slim box that a Panda tosses."""
+    drawn = small(arm=True)
+    return replace(drawn, family="box", camera=replace(drawn.camera, focal_px=390.0, distance_m=0.9))
+
+
+def test_the_arm_holds_the_object_until_it_opens_and_then_it_flies():
+    drawn = armed()
+    built = scene.build(drawn)
+    assert built.arm is not None
+    thrown = throws.Thrower(drawn, built).throw(0)
+    from_tool = built.arm.held.object_from_tool
+    held, opened = thrown.instants.release_s - 0.3, thrown.instants.release_s + built.arm.config.finger_open_s
+    for t in np.linspace(0, held, 5):
+        tool = built.arm.world_from_tool(thrown.swing.q_rad(t))
+        gap = thrown.object.at(t).points(from_tool.translation_m) - tool.translation_m
+        assert np.linalg.norm(gap) < 0.004  # it may slip by 3 mm
+    later = thrown.object.at(opened + 0.08).points(from_tool.translation_m)
+    tool = built.arm.world_from_tool(thrown.swing.q_rad(opened + 0.08))
+    assert np.linalg.norm(later - tool.translation_m) > 0.01
+
+
+def test_what_is_too_thick_for_the_hand_is_tossed_without_an_arm():
+    assert arms.grasp_of(np.array(trimesh.creation.box((0.09, 0.1, 0.12)).vertices)) is None
+    assert arms.grasp_of(np.array(trimesh.creation.box((0.06, 0.1, 0.12)).vertices)).width_m == pytest.approx(0.06)
+
+
+def test_the_session_says_a_hand_eye_that_is_off_by_what_the_spec_says():
+    drawn = armed()
+    built = scene.build(drawn)
+    camera, place = session.believed(drawn, built)
+    off = built.world_from_camera.inverse() @ place
+    assert np.linalg.norm(off.translation_m) == pytest.approx(drawn.wrong.camera_m, rel=1e-6)
+    assert camera.fx / built.camera.fx == pytest.approx(1 + drawn.wrong.focal_share)
+    base = session.believed_base(drawn, built)
+    wrong = built.arm.world_from_base.inverse() @ base
+    assert np.linalg.norm(wrong.translation_m) == pytest.approx(drawn.wrong.hand_eye_m, rel=1e-6)
+    assert np.degrees(rotation_angle_rad(wrong.rotation)) == pytest.approx(drawn.wrong.hand_eye_deg, rel=1e-4)
