@@ -4,6 +4,7 @@ python tools/bench_variety.py --split choose --n 20                 # settings m
 python tools/bench_variety.py --split judge --n 60 --resume         # the judge table, at the end of an issue only
 python tools/bench_variety.py --split choose --n 9 --family mug --variant bundlesdf-10 --tosses 2
 python tools/bench_variety.py --make choose-003 --out DIR           # one session, kept
+python tools/bench_variety.py --sheet docs/variety.png --n 24             # a random frame of each, to be looked at
 python tools/bench_variety.py --move judge-007 --why "looked into: lost on the steel table"
 
 A session at a time, made on the fly (path tracing needs Blender: `make blender`); what is finished stays in --out and
@@ -54,6 +55,12 @@ def main() -> int:
             print(f"{given.move} is a choose case from now on; {fresh.name} (seed {fresh.seed}) takes its place")
             return 0
         blender()
+        if given.sheet:
+            from variety.sheet import write_sheet
+
+            wanted = seeds.cases("choose", given.n, seeds.read_ledger())
+            print(f"{given.sheet}: {write_sheet(wanted, given.sheet, given.threads)} frames")
+            return 0
         if given.make:
             return _make_one(given)
         return _bench(given)
@@ -67,6 +74,7 @@ def _parser() -> argparse.ArgumentParser:
     what = parser.add_mutually_exclusive_group(required=True)
     what.add_argument("--split", choices=seeds.SPLITS)
     what.add_argument("--make", metavar="CASE", help="make this session and keep it")
+    what.add_argument("--sheet", metavar="PNG", type=Path, help="a random frame of each of N choose cases")
     what.add_argument("--move", metavar="CASE", help="a judge case was looked into: it becomes a choose case")
     parser.add_argument("--why", help="reason of a move")
     parser.add_argument("--n", type=int, default=9, help="the first N cases of the split")

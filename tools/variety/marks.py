@@ -15,7 +15,7 @@ from numpy import ndarray as Array
 from processing.metrics import align_first
 from processing.score import Value, chamfers, score_variant, true_mesh
 from processing.truth import Truth, open_truth
-from recordings.geometry import nearest_rotation, rotation_log
+from recordings.geometry import rotation_log
 from recordings.results import Results, VariantRecord
 from recordings.session import Session
 from recordings.tracks import ObjectTrack
@@ -106,7 +106,7 @@ def silent_wrong(track: ObjectTrack, true: Float[Array, "n 4 4"], round_body: bo
             cosine = float(np.clip(found[:3, 2] @ true[k][:3, 2], -1, 1))
             angle = np.degrees(np.arccos(cosine))
         else:
-            angle = np.degrees(np.linalg.norm(rotation_log(nearest_rotation(found[:3, :3] @ true[k][:3, :3].T))))
+            angle = np.degrees(np.linalg.norm(rotation_log(_orthonormal(found[:3, :3] @ true[k][:3, :3].T))))
         out[k] = angle > WRONG_DEG or np.linalg.norm(found[:3, 3] - true[k][:3, 3]) > WRONG_M
     return out
 
@@ -122,15 +122,26 @@ def normalised_errors(track: ObjectTrack, true: Float[Array, "n 4 4"]) -> Float[
         return np.zeros(0)
     shifts = np.array([np.linalg.inv(true[k]) @ track.camera_from_object[k] for k in rows])
     best = np.eye(4)
-    best[:3, :3] = nearest_rotation(shifts[:, :3, :3].mean(axis=0))
+    best[:3, :3] = _mean_rotation(shifts[:, :3, :3])
     best[:3, 3] = np.median(shifts[:, :3, 3], axis=0)
     out = []
     for k in rows:
         found, wanted = track.camera_from_object[k], true[k] @ best
-        e = np.append(rotation_log(nearest_rotation(found[:3, :3] @ wanted[:3, :3].T)), found[:3, 3] - wanted[:3, 3])
+        e = np.append(rotation_log(_orthonormal(found[:3, :3] @ wanted[:3, :3].T)), found[:3, 3] - wanted[:3, 3])
         spread = track.covariance[k] + 1e-12 * np.eye(6)
         out.append(float(e @ np.linalg.solve(spread, e)))
     return np.array(out)
+
+
+def _orthonormal(matrix: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
+    """The rotation nearest to any matrix, however far (a mean of rotations that scatter is far)."""
+    u, _, vt = np.linalg.svd(matrix)
+    return u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+
+
+def _mean_rotation(rotations: Float[Array, "n 3 3"]) -> Float[Array, "3 3"]:
+    """The chordal mean."""
+    return _orthonormal(rotations.mean(axis=0))
 
 
 def fusion_floor_cm(session_path: Path, truth_path: Path, place: Path) -> float | None:

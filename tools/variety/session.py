@@ -69,7 +69,7 @@ def make(
         made = Made(spec, scene, painter, pair, Sight(scene), out, truth)
         _session_files(made, thrower.ground)
         times = [_frame_times(spec, throw) for throw in throws]
-        painter.render([_shot(spec, throw, t) for throw, of in zip(throws, times) for t in of])
+        painter.render([shot_of(spec, throw, t) for throw, of in zip(throws, times) for t in of])
         for throw, of in zip(throws, times):
             _toss(made, throw, of)
             (progress or Silent()).step(throw.number + 1, len(throws), f"{spec.name} toss {throw.number}")
@@ -121,9 +121,9 @@ def _toss(made: Made, throw: Throw, times: Float[Array, " n"]) -> None:
     delay = spec.wrong.depth_delay_s
     shares = []
     for k, t in enumerate(times):
-        picture = camera.develop(made.painter.picture(_shot(spec, throw, t)), k, rng)
+        picture = camera.develop(made.painter.picture(shot_of(spec, throw, t)), k, rng)
         (here / "rgb" / f"{k:06d}.jpg").write_bytes(jpeg(picture, spec.camera.jpeg))
-        _png(here / "depth" / f"{k:06d}.png", _depth(made, throw, t + delay, rng))
+        _png(here / "depth" / f"{k:06d}.png", depth_at(made, throw, t + delay, rng))
         mask, hand, visible = made.sight.masks(_placed(throw, t + _row_delay(made, throw, t)))
         shares.append(visible)
         _png(there / "masks" / f"{k:06d}.png", 255 * mask.astype(np.uint8))
@@ -160,7 +160,7 @@ def _placed(throw: Throw, time_s: float) -> list[tuple[str, Transform]]:
     return [("object", throw.object.at(time_s)), *((n, p) for n, p in places if p is not None)]
 
 
-def _shot(spec: Spec, throw: Throw, time_s: float) -> Shot:
+def shot_of(spec: Spec, throw: Throw, time_s: float) -> Shot:
     """Where what moves is when the first row opens and when the last one closes."""
     half = 0.5 * (spec.camera.exposure_s + spec.camera.readout_s)
     begin, end = dict(_placed(throw, time_s - half)), dict(_placed(throw, time_s + half))
@@ -176,7 +176,7 @@ def _row_delay(made: Made, throw: Throw, time_s: float) -> float:
     return made.spec.camera.readout_s * (np.clip(row / made.scene.camera.height, 0, 1) - 0.5)
 
 
-def _depth(made: Made, throw: Throw, time_s: float, rng: np.random.Generator) -> Array:
+def depth_at(made: Made, throw: Throw, time_s: float, rng: np.random.Generator) -> Array:
     """One depth image aligned to colour, in the device's unit."""
     spec = made.spec.depth
     spread = spec.exposure_s * ((np.arange(INSTANTS) + 0.5) / INSTANTS - 0.5)

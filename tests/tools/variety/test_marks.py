@@ -81,6 +81,12 @@ def test_a_covariance_ten_times_too_small_is_found_out():
     assert marks.normalised_errors(track(poses, sigma=(0.001, 0.002)), TRUE).mean() / 6 > 10
 
 
+def test_a_track_that_turns_away_all_the_time_is_judged_and_not_refused():
+    poses = np.array([T @ pose((0, 0, 0.1 * k), (0, 0, 0)) for k, T in enumerate(TRUE)])
+    assert marks.normalised_errors(track(poses), TRUE).mean() / 6 > 100
+    assert marks.silent_wrong(track(poses), TRUE, False)[1:].all()
+
+
 def row(case, add, **more):
     marked = {
         "frames": 40, "lost": 0, "flagged": 3, "silent": 2, "silent_tosses": 1, "add": add,
