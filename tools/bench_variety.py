@@ -58,8 +58,8 @@ def main() -> int:
         if given.sheet:
             from variety.sheet import write_sheet
 
-            wanted = seeds.cases("choose", given.n, seeds.read_ledger())
-            print(f"{given.sheet}: {write_sheet(wanted, given.sheet, given.threads)} frames")
+            wanted = seeds.cases("choose", 2 * given.n, seeds.read_ledger())
+            print(f"{given.sheet}: {write_sheet(wanted, given.sheet, given.n, given.threads)} frames")
             return 0
         if given.make:
             return _make_one(given)

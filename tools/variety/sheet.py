@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import tempfile
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -19,7 +20,7 @@ from variety.colour import Painter
 from variety.infrared import Pair
 from variety.scene import SENSOR, build, generator
 from variety.seeds import Case
-from variety.spec import draw
+from variety.spec import Spec, draw
 from variety.throws import Thrower, moving_items
 
 TILE_PX = (200, 150)
@@ -29,12 +30,16 @@ FAR_M = 1.6
 COLORS = 256
 
 
-def write_sheet(cases: Sequence[Case], path: Path, threads: int = 2) -> int:
-    """One random frame of each case's first toss; how many could be shown. The picture keeps 256 colours."""
+def write_sheet(cases: Sequence[Case], path: Path, count: int, threads: int = 2) -> int:
+    """A random frame of the first toss of `count` cases, those that cannot be shown left out and named on stderr;
+    returns how many are shown. The picture keeps 256 colours. Pictures wider than two tiles are rendered at half size.
+    """
     from PIL import Image
 
     tiles = []
     for case in cases:
+        if len(tiles) == count:
+            break
         try:
             tiles.append(tile(case, threads))
             print(f"{case.name}: shown", file=sys.stderr, flush=True)
@@ -49,7 +54,7 @@ def write_sheet(cases: Sequence[Case], path: Path, threads: int = 2) -> int:
 
 def tile(case: Case, threads: int) -> UInt8[Array, "h w 3"]:
     """A frame at a random time: the picture as the file has it, and depth blue (near) to red (FAR_M), black none."""
-    spec = draw(case, 1)
+    spec = half_size(draw(case, 1))
     scene = build(spec)
     throw = Thrower(spec, scene).throw(0)
     rng = generator(spec, SENSOR, 3)
@@ -67,6 +72,18 @@ def tile(case: Case, threads: int) -> UInt8[Array, "h w 3"]:
     shown = cv2.applyColorMap(np.clip(255 * depth / FAR_M, 0, 255).astype(np.uint8), cv2.COLORMAP_TURBO)
     shown[depth == 0] = 0
     return np.hstack([_fitted(color, cv2.INTER_AREA), _fitted(shown, cv2.INTER_NEAREST)])[..., ::-1].copy()
+
+
+def half_size(spec: Spec) -> Spec:
+    """The same session with a colour camera of half the pixels each way, where a tile shows no more of them anyway."""
+    if spec.camera.width <= 2 * TILE_PX[0]:
+        return spec
+    c = spec.camera
+    camera = replace(
+        c, width=c.width // 2, height=c.height // 2, focal_px=c.focal_px / 2, blur_px=c.blur_px / 2,
+        center_off_px=(c.center_off_px[0] / 2, c.center_off_px[1] / 2),
+    )  # fmt: skip
+    return replace(spec, camera=camera)
 
 
 def _fitted(picture: UInt8[Array, "h w 3"], how: int) -> UInt8[Array, "u v 3"]:
