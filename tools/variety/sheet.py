@@ -23,7 +23,7 @@ from variety.seeds import Case
 from variety.spec import Spec, draw
 from variety.throws import Thrower, moving_items
 
-TILE_PX = (200, 150)
+TILE_PX = (240, 140)
 COLUMNS = 4
 """Of pairs."""
 FAR_M = 1.6
