@@ -179,7 +179,7 @@ def _processed(imported: Path, truth: Path, out: Path, options: Sequence[str]) -
 def _warnings(out: Path) -> list[str]:
     from recordings.results import Results
 
-    return list(Results.open(out).find().warnings)
+    return [notice.text for notice in Results.open(out).find().warnings]
 
 
 def _cpu_s() -> float:

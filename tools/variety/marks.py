@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray as Array
 
-from processing.metrics import align_first
+from processing.learned_values import learned_values
 from processing.score import Value, chamfers, score_variant, true_mesh
 from processing.truth import Truth, open_truth
 from recordings.geometry import rotation_log
@@ -45,6 +45,7 @@ class Marks:
     nees: float | None
     friction: float | None
     friction_inside: bool | None
+    restitution: float | None
 
 
 def read_marks(results_path: Path, session_path: Path, truth_path: Path) -> Marks:
@@ -74,16 +75,17 @@ def _marks(results: Results, record: VariantRecord, truth: Truth, spec: Mapping[
         tracked += sum(s == "tracked" for s in track.status)
         errors.append(normalised_errors(track, true))
     nees = np.concatenate(errors) if errors else np.zeros(0)
-    model = results.contact(record.name, record.scope) if record.contact else None
-    inside = None
-    if model is not None and truth.friction is not None:
-        inside = bool(model.friction_low <= truth.friction <= model.friction_high)
+    learned = learned_values(results, record)
+    friction, inside = learned.get("friction"), None
+    if friction is not None and truth.friction is not None and friction.low is not None and friction.high is not None:
+        inside = bool(friction.low <= truth.friction <= friction.high)
     value = scored.values
     return Marks(
         frames, sum(int(t.lost.sum()) for t in tracks.values()), frames - tracked, wrong, tosses,
         _of(value, "add_auc") or 0.0, _of(value, "adds_auc") or 0.0, _of(value, "success_5deg_5cm") or 0.0,
         _of(value, "cd_icp"), float((nees < CHI2_6_95).mean()) if len(nees) else None,
-        float(nees.mean() / 6) if len(nees) else None, None if model is None else model.friction, inside,
+        float(nees.mean() / 6) if len(nees) else None, _of(learned, "friction"), inside,
+        _of(learned, "restitution"),
     )  # fmt: skip
 
 
@@ -92,12 +94,14 @@ def _of(values: Mapping[str, Value], name: str) -> float | None:
 
 
 def silent_wrong(track: ObjectTrack, true: Float[Array, "n 4 4"], round_body: bool) -> Bool[Array, " n"]:
-    """Frames called tracked that are off by more than WRONG_DEG or WRONG_M, each toss aligned at its first frame.
+    """Frames called tracked that are off by more than WRONG_DEG or WRONG_M; a toss is aligned at its first tracked one.
     Of a plain body of revolution only the direction of its axis is judged."""
     out = np.zeros(len(track.status), dtype=bool)
-    shift = align_first(track.camera_from_object, true)
-    if shift is None:
+    known = np.array([s == "tracked" for s in track.status]) & np.isfinite(true).all(axis=(1, 2))
+    if not known.any():
         return out
+    first = int(np.flatnonzero(known)[0])
+    shift = np.linalg.inv(track.camera_from_object[first]) @ true[first]
     for k, status in enumerate(track.status):
         if status != "tracked" or not np.isfinite(true[k]).all():
             continue
@@ -145,12 +149,13 @@ def _mean_rotation(rotations: Float[Array, "n 3 3"]) -> Float[Array, "3 3"]:
 
 
 def fusion_floor_cm(session_path: Path, truth_path: Path, place: Path) -> float | None:
-    """Chamfer distance of what all tosses show, fused at the true poses within the true masks: no estimate of a pose
-    or mask is in it. None where nothing can be fused."""
+    """Chamfer distance of what all tosses show, fused at the true poses within the true masks and with the true
+    depth scale: no estimate is in it. None where nothing can be fused."""
     from processing.config import Config
     from processing.field.fuse import fuse
     from processing.field.learn import TossViews, chosen_views
     from processing.field.mesh import grid_mesh
+    from processing.frames import with_depth_scale
     from processing.pipeline import start_run
     from recordings.errors import BadInput
     from recordings.progress import Silent
@@ -162,9 +167,10 @@ def fusion_floor_cm(session_path: Path, truth_path: Path, place: Path) -> float 
         mesh = None if truth is None else true_mesh(truth)
         if truth is None or mesh is None:
             return None
+        scale = float(json.loads((truth_path / "sensor_truth.json").read_text())["depth_scale"])
         tosses = []
         for number in session.tosses:
-            frames = run.frames(number)
+            frames = with_depth_scale(session.toss(number).rgbd("d455"), scale)
             track = _known(ObjectTrack.nowhere(number, run.camera.frame, frames.times_ns), truth)
             tosses.append(TossViews(frames, frames.depth_times_ns, _masks(truth_path / f"toss_{number:02d}"), track))
         views = chosen_views(tosses, run.camera, run.config.shape)

@@ -27,12 +27,13 @@ TILE_PX = (240, 140)
 COLUMNS = 4
 """Of pairs."""
 FAR_M = 1.6
-COLORS = 256
+KEPT_BITS = np.uint8(0xFC)
+"""Of a colour: noise in the lowest bits makes a file large and shows nothing."""
 
 
 def write_sheet(cases: Sequence[Case], path: Path, count: int, threads: int = 2) -> int:
     """A random frame of the first toss of `count` cases, those that cannot be shown left out and named on stderr;
-    returns how many are shown. The picture keeps 256 colours. Pictures wider than two tiles are rendered at half size.
+    returns how many are shown. Pictures wider than two tiles are rendered at half size.
     """
     from PIL import Image
 
@@ -48,7 +49,7 @@ def write_sheet(cases: Sequence[Case], path: Path, count: int, threads: int = 2)
     blank = np.zeros_like(tiles[0])
     tiles += [blank] * (-len(tiles) % COLUMNS)
     rows = [np.hstack(tiles[k : k + COLUMNS]) for k in range(0, len(tiles), COLUMNS)]
-    Image.fromarray(np.vstack(rows)).quantize(COLORS, dither=Image.Dither.NONE).save(path, optimize=True)
+    Image.fromarray(np.vstack(rows) & KEPT_BITS).save(path, optimize=True)
     return len(tiles)
 
 

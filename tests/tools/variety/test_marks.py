@@ -92,6 +92,7 @@ def row(case, add, **more):
         "frames": 40, "lost": 0, "flagged": 3, "silent": 2, "silent_tosses": 1, "add": add,
         "adds": 99.0, "success": 90.0,
         "chamfer_cm": 0.2, "inside_95": 0.9, "nees": 1.5, "friction": 0.3, "friction_inside": True,
+        "restitution": None,
     }  # fmt: skip
     return {
         "case": case, "seed": 1, "family": "box", "commit": "abc", "floor_cm": 0.1,
