@@ -3,12 +3,15 @@
     lens = calibrate_intrinsics("mono0", (1440, 1080), views)
     lens.model, lens.report.verdict
 
-Several lens models are fitted and judged on views kept aside; the simplest one that is not clearly worse is taken.
+Several lens models are fitted, also by plain least squares (what cv2.calibrateCamera does) and with the board's print
+left open, and judged on views kept aside: there only the board's pose is found, on the layout as it is stated. The
+simplest lens that is not worse is taken. On real boards (`tools/bench_calibration.py`) a print left open never helped
+the lens there; a lens whose numbers its image circle does not support is refused.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -16,20 +19,19 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray as Array
 
-from calibration.bundle import Observations, Scene, Solved, adjust
-from calibration.extrinsics import AS_GOOD, LEAST_POINTS, PRINT_M, bad_views, board_pose, judge_print, whitening
+from calibration.extrinsics import AS_GOOD, LEAST_POINTS, PRINT_M, judge_print
+from calibration.lens_fit import HUBER, LEAST_VIEWS, Fit, Way, pose_only
+from calibration.lens_support import unsupported
 from calibration.projected import lens_numbers, with_lens
 from calibration.report import Finding, Report, limit
-from calibration.targets import TargetView, numbered_marks
+from calibration.targets import TargetView
 from recordings.errors import BadInput
 from recordings.geometry import COEFFICIENTS, CameraModel, DistortionModel
 
-LEAST_VIEWS = 5
 GOOD_VIEWS = 10
 GOOD_PX, WORST_PX = 0.5, 2.0
 GOOD_FOCAL_PERCENT, WORST_FOCAL_PERCENT = 0.3, 2.0
-FOLDS = 4
-CLEARLY_WORSE = 1.05
+WORSE = 1.005
 """A lens model with fewer numbers is taken unless its hold-out error is this many times the best one's."""
 CELLS = 6
 LEAST_COVERAGE = 0.6
@@ -69,13 +71,16 @@ def calibrate_intrinsics(
             "`toss-record --calibration board`"
         )
     first = given if given is not None and given.distortion_model == "none" else _first_guess(camera, size, used)
-    fits = {kind: _Fit.of(_bare(first, kind), used) for kind in lens_models}
+    fits = {kind: Fit.of(_bare(first, kind), used, Way(HUBER)) for kind in lens_models}
     kind = _simplest(fits)
-    fit = fits[kind]
+    open_print = Fit.of(fits[kind].model, used, Way(HUBER, PRINT_M), fits[kind].rejected)
+    fit = _best(fits, kind, open_print, first, used)
+    kind = fit.model.distortion_model
     kept = _kept(camera, given, fit, used) if given is not None and (given.width, given.height) == size else None
     if kept is not None and not anew:
         return kept
-    findings = [*_judge(camera, fit, used, size), *_against_given(camera, given, fit.model)]
+    findings = [*_judge(camera, fit, used, size), *judge_print(open_print.solved)]
+    findings += _against_given(camera, given, fit.model)
     if kept is not None:
         findings.append(_no_better(camera, fit))
     report = Report(
@@ -84,16 +89,31 @@ def calibrate_intrinsics(
         {"rms_px": fit.hold_out_px, "rms_px_by_lens": {k: f.hold_out_px for k, f in fits.items()}},
         _uncertainty(fit),
         tuple(findings),
-        {"lens": kind, "coverage": coverage(fit.seen.pixels, size), "rejected_views": sorted(fit.rejected)},
+        {
+            "lens": kind,
+            "fitted": fit.way.name,
+            "unsupported": {k: why for k, f in fits.items() if (why := unsupported(f.model)) is not None},
+            "coverage": coverage(fit.seen.pixels, size),
+            "rejected_views": sorted(fit.rejected),
+        },
     )
     return Lens(fit.model, report, fit.solved.residual_px, fit.seen.pixels)
 
 
-def _kept(camera: str, given: CameraModel, fit: _Fit, views: Sequence[TargetView]) -> Lens | None:
+def as_good_alone(lens: Lens, other: CameraModel, views: Sequence[TargetView]) -> bool:
+    """Whether another lens is supported and explains this camera's views as well as `lens` did those kept aside."""
+    rejected = lens.report.details["rejected_views"]
+    used = [view for view in views if len(view) >= LEAST_POINTS]
+    solved, _ = pose_only(other, used, [v for v in range(len(used)) if v not in rejected])
+    rms_px = float(np.sqrt((solved.residual_px**2).mean()))
+    return unsupported(other) is None and rms_px <= float(lens.report.hold_out["rms_px"])
+
+
+def _kept(camera: str, given: CameraModel, fit: Fit, views: Sequence[TargetView]) -> Lens | None:
     """The given lens, where it explains the views as well as the fitted one does views that it has not seen: few views,
     or views of the image's middle only, know a lens less well than its maker."""
     numbers = [v for v in range(len(views)) if v not in fit.rejected]
-    solved, seen = _solve(given, views, numbers, free_lens=False)
+    solved, seen = pose_only(given, views, numbers)
     if solved.rms_px > AS_GOOD * fit.hold_out_px:
         return None
     text = (
@@ -119,7 +139,7 @@ def _kept(camera: str, given: CameraModel, fit: _Fit, views: Sequence[TargetView
     return Lens(given, report, solved.residual_px, seen.pixels)
 
 
-def _no_better(camera: str, fit: _Fit) -> Finding:
+def _no_better(camera: str, fit: Fit) -> Finding:
     open_by = _uncertainty(fit)["focal_percent"]
     return Finding(
         "warning",
@@ -132,71 +152,6 @@ def coverage(pixels: Float[Array, "n 2"], size: tuple[int, int]) -> float:
     """Share of a 6 x 6 grid over the image that holds points."""
     cell = np.floor(pixels / np.array(size) * CELLS).clip(0, CELLS - 1).astype(int)
     return len(np.unique(cell[:, 0] * CELLS + cell[:, 1])) / CELLS**2
-
-
-@dataclass(frozen=True, eq=False)
-class _Fit:
-    solved: Solved
-    seen: Observations
-    rejected: tuple[int, ...]
-    hold_out_px: float
-
-    @property
-    def model(self) -> CameraModel:
-        return self.solved.scene.models[0]
-
-    @staticmethod
-    def of(start: CameraModel, views: Sequence[TargetView]) -> _Fit:
-        """All views, then without those that do not fit; and each quarter of them kept aside once."""
-        solved, seen = _solve(start, views, range(len(views)))
-        rejected = tuple(v for _, v in bad_views(solved, seen))
-        numbers = [v for v in range(len(views)) if v not in rejected]
-        if rejected and len(numbers) >= LEAST_VIEWS:
-            solved, seen = _solve(start, views, numbers)
-        else:
-            rejected, numbers = (), list(range(len(views)))
-        gaps = []
-        for fold in range(FOLDS):
-            aside = numbers[fold::FOLDS]
-            rest, _ = _solve(solved.scene.models[0], views, [v for v in numbers if v not in aside])
-            known = rest.scene
-            gaps.append(_solve(known.models[0], views, aside, known.shift_m)[0].residual_px)
-        return _Fit(solved, seen, rejected, float(np.sqrt((np.concatenate(gaps) ** 2).mean())))
-
-
-def _solve(
-    start: CameraModel,
-    views: Sequence[TargetView],
-    numbers: Sequence[int],
-    shift_m: Float[Array, "m 3"] | None = None,
-    free_lens: bool = True,
-) -> tuple[Solved, Observations]:
-    """Lens (where free), board poses and what the board's print is off, from the views of these numbers; with that
-    print known (`shift_m`) the poses alone."""
-    poses, chosen = np.tile(np.eye(4), (len(views), 1, 1)), []
-    for v in numbers:
-        found = board_pose(start, views[v])
-        if found:
-            poses[v] = found[0]
-            chosen.append(v)
-    if not chosen:
-        raise BadInput(f"no pose of the board fits the views of {start.frame}; is its layout as stated?")
-    counts = [len(views[v]) for v in chosen]
-    marks, many = numbered_marks([(0, view) for view in views])
-    seen = Observations(
-        np.zeros(sum(counts), dtype=np.int64),
-        np.repeat(chosen, counts),
-        np.zeros(sum(counts), dtype=np.int64),
-        np.concatenate([views[v].points_m for v in chosen]),
-        np.concatenate([views[v].pixels for v in chosen]),
-        whitening(np.concatenate([views[v].covariance_px2 for v in chosen])),
-        np.concatenate([marks[v] for v in chosen]),
-    )
-    one, no = np.eye(4)[None], np.zeros(1, dtype=bool)
-    free_views, lens = np.isin(np.arange(len(views)), chosen), np.array([free_lens and shift_m is None])
-    shift, print_m = (np.zeros((many, 3)), PRINT_M) if shift_m is None else (shift_m, None)
-    scene = Scene((start,), one, poses, one, no, free_views, no, lens, np.ones(1), no, shift, print_m)
-    return adjust(scene, seen), seen
 
 
 def _first_guess(camera: str, size: tuple[int, int], views: Sequence[TargetView]) -> CameraModel:
@@ -216,24 +171,45 @@ def _bare(start: CameraModel, kind: DistortionModel) -> CameraModel:
     return replace(start, distortion_model=kind, distortion=(0.0,) * COEFFICIENTS[kind])
 
 
-def _simplest(fits: dict[DistortionModel, _Fit]) -> DistortionModel:
-    best = min(f.hold_out_px for f in fits.values())
-    fine = [k for k, f in fits.items() if f.hold_out_px <= CLEARLY_WORSE * best]
-    return min(fine, key=lambda k: COEFFICIENTS[k])
+def _simplest(fits: Mapping[DistortionModel, Fit]) -> DistortionModel:
+    """Of the lenses that their image circles support (of all where none is), the one with the fewest numbers among
+    those as good on views kept aside as the best."""
+    fine = {k: f for k, f in fits.items() if unsupported(f.model) is None} or fits
+    best = min(f.hold_out_px for f in fine.values())
+    return min((k for k, f in fine.items() if f.hold_out_px <= WORSE * best), key=lambda k: COEFFICIENTS[k])
 
 
-def _judge(camera: str, fit: _Fit, views: Sequence[TargetView], size: tuple[int, int]) -> list[Finding]:
+def _best(
+    fits: Mapping[DistortionModel, Fit],
+    kind: DistortionModel,
+    open_print: Fit,
+    first: CameraModel,
+    views: Sequence[TargetView],
+) -> Fit:
+    """The chosen lens fitted the way that is best on views kept aside, never worse there than plain least squares of
+    the lens that cv2.calibrateCamera fits."""
+    fit, rejected = fits[kind], fits[kind].rejected
+    others = [open_print, Fit.of(fit.model, views, Way(None), rejected)]
+    if kind != "brown-conrady" and "brown-conrady" in fits:
+        others.append(Fit.of(_bare(first, "brown-conrady"), views, Way(None), rejected))
+    fine = [f for f in others if unsupported(f.model) is None and f.hold_out_px < fit.hold_out_px]
+    return min(fine, key=lambda f: f.hold_out_px, default=fit)
+
+
+def _judge(camera: str, fit: Fit, views: Sequence[TargetView], size: tuple[int, int]) -> list[Finding]:
     found = limit(fit.solved.rms_px, f"{camera}'s residual", "px", GOOD_PX, WORST_PX)
     found += limit(fit.hold_out_px, f"{camera}'s residual on views kept aside", "px", GOOD_PX, WORST_PX)
     focal = _uncertainty(fit)["focal_percent"]
-    found += judge_print(fit.solved)
+    why = unsupported(fit.model)
+    if why is not None:
+        found.append(Finding("refused", f"{camera}: {why}; ask for a simpler lens, or show the board up to the edges"))
     found += limit(focal, f"the deviation of {camera}'s focal length", "%", GOOD_FOCAL_PERCENT, WORST_FOCAL_PERCENT)
     if fit.rejected:
         found.append(Finding("note", f"{camera}: {len(fit.rejected)} views left out for their residuals"))
     return found + _judge_views(camera, fit, views, size)
 
 
-def _judge_views(camera: str, fit: _Fit, views: Sequence[TargetView], size: tuple[int, int]) -> list[Finding]:
+def _judge_views(camera: str, fit: Fit, views: Sequence[TargetView], size: tuple[int, int]) -> list[Finding]:
     """Whether there are enough views, all over the image and tilted."""
     found = []
     if len(views) < GOOD_VIEWS:
@@ -253,7 +229,7 @@ def _judge_views(camera: str, fit: _Fit, views: Sequence[TargetView], size: tupl
     return found
 
 
-def _bare_parts(fit: _Fit, size: tuple[int, int]) -> str:
+def _bare_parts(fit: Fit, size: tuple[int, int]) -> str:
     """Where in the image there are the fewest points."""
     side = np.floor(fit.seen.pixels / np.array(size) * 3).clip(0, 2).astype(int)
     counts = np.zeros((3, 3))
@@ -266,13 +242,13 @@ def _bare_parts(fit: _Fit, size: tuple[int, int]) -> str:
     return ", ".join(empty.tolist()) or "nearer, so that it fills the image"
 
 
-def _tilts_deg(fit: _Fit) -> Float[Array, " v"]:
+def _tilts_deg(fit: Fit) -> Float[Array, " v"]:
     """Angle between the board's normal and the optical axis, per view."""
     poses = fit.solved.scene.rig_from_body[np.unique(fit.seen.view)]
     return np.degrees(np.arccos(np.abs(poses[:, 2, 2]).clip(0, 1)))
 
 
-def _uncertainty(fit: _Fit) -> dict[str, float]:
+def _uncertainty(fit: Fit) -> dict[str, float]:
     std, model = fit.solved.std("lens", 0), fit.model
     return {
         "focal_percent": 100 * float(max(std[0] / model.fx, std[1] / model.fy)),
@@ -281,7 +257,7 @@ def _uncertainty(fit: _Fit) -> dict[str, float]:
     }
 
 
-def _projection_spread_px(fit: _Fit) -> float:
+def _projection_spread_px(fit: Fit) -> float:
     """How far pixels move among lenses drawn from the covariance, over the whole image, after the rotation that
     explains most of it (a camera's pose would take that up): root mean square over grid and draws."""
     model, where = fit.model, fit.solved.blocks["lens", 0]
