@@ -148,6 +148,20 @@ def test_a_bumped_camera_is_named_with_its_toss(toss_lab):
     assert found.moved[("mono1", 2)][1] > 3 * found.moved[("mono1", 0)][1]
 
 
+@pytest.mark.parametrize(("camera", "axis"), [("mono0", 1), ("mono1", 0), ("mono2", 2)])
+def test_a_bump_of_3_mm_in_the_only_toss_is_said_and_the_stated_deviation_covers_it(toss_lab, camera, axis):
+    bump = Transform("camera", "camera", np.eye(3), 0.003 * np.eye(3)[axis])
+    made = toss_lab(tosses=1, bumped=(camera, 0, bump))
+    found, verdict = solved(made)
+    assert any("bumped" in w and "calibration.json" in w for w in verdict.warnings)
+    assert set(found.displaced) <= {camera}
+    track = found.tracks[0]
+    placed = track.world_from_tagged @ found.layout[0] @ np.linalg.inv(made.layout[0])
+    off_m = np.sqrt(((placed - made.truth[0])[:, :3, 3] ** 2).sum(axis=1).mean())
+    stated_m = np.sqrt(np.einsum("nii->n", track.covariance[:, 3:, 3:]).mean())
+    assert off_m < stated_m < 0.002
+
+
 def test_a_wrong_tag_size_is_found_and_the_right_one_told(made):
     body = frozenset(range(6))
     measured = measured_sizes_m(triangulated_tags(made.sightings, made.calibration), body)
