@@ -103,7 +103,7 @@ class Solved:
     displaced: tuple[str, ...] = ()
     """Cameras that do not stand where the calibration has them; what was seen placed them."""
     tension: float = 1.0
-    """By how many standard deviations the other cameras' places are contradicted; deviations are as many times wider."""
+    """By how many standard deviations the cameras' places are still contradicted; deviations are as many times wider."""
 
 
 def solve_session(
@@ -268,8 +268,8 @@ def _without_wrong_places(
     solver: SolverConfig,
 ) -> tuple[Solution, tuple[str, ...], float]:
     """Cameras that what was seen pulls away from their calibrated places: their places hardly count any more, the most
-    pulled one first. Two stay as they are, or nothing but the table would hold the world. Also the largest contradiction that
-    remains, in standard deviations."""
+    pulled one first. Two stay as they are, or nothing but the table would hold the world. Also the largest
+    contradiction that remains, in standard deviations."""
     names = {index[camera_key(c.name)]: c.name for c in problem.config.cameras if camera_key(c.name) in index}
     loosened: list[str] = []
     while True:
