@@ -3,10 +3,9 @@
     lens = calibrate_intrinsics("mono0", (1440, 1080), views)
     lens.model, lens.report.verdict
 
-Several lens models are fitted, also by plain least squares (what cv2.calibrateCamera does) and with the board's print
-left open, and judged on views kept aside: there only the board's pose is found, on the layout as it is stated. The
-simplest lens that is not worse is taken. On real boards (`tools/bench_calibration.py`) a print left open never helped
-the lens there; a lens whose numbers its image circle does not support is refused.
+Several lens models are fitted, also by plain least squares (what cv2.calibrateCamera does), and judged on views kept aside: there only the board's pose is found, on the layout as it is stated. The
+simplest lens that is not worse is taken. On real boards leaving the print open moved focal
+lengths by .5 % and explained no view better, so it only judges the board; a lens whose numbers its image circle does not support is refused.
 """
 
 from __future__ import annotations
@@ -74,7 +73,7 @@ def calibrate_intrinsics(
     fits = {kind: Fit.of(_bare(first, kind), used, Way(HUBER)) for kind in lens_models}
     kind = _simplest(fits)
     open_print = Fit.of(fits[kind].model, used, Way(HUBER, PRINT_M), fits[kind].rejected)
-    fit = _best(fits, kind, open_print, first, used)
+    fit = _best(fits, kind, first, used)
     kind = fit.model.distortion_model
     kept = _kept(camera, given, fit, used) if given is not None and (given.width, given.height) == size else None
     if kept is not None and not anew:
@@ -182,14 +181,13 @@ def _simplest(fits: Mapping[DistortionModel, Fit]) -> DistortionModel:
 def _best(
     fits: Mapping[DistortionModel, Fit],
     kind: DistortionModel,
-    open_print: Fit,
     first: CameraModel,
     views: Sequence[TargetView],
 ) -> Fit:
     """The chosen lens fitted the way that is best on views kept aside, never worse there than plain least squares of
     the lens that cv2.calibrateCamera fits."""
     fit, rejected = fits[kind], fits[kind].rejected
-    others = [open_print, Fit.of(fit.model, views, Way(None), rejected)]
+    others = [Fit.of(fit.model, views, Way(None), rejected)]
     if kind != "brown-conrady" and "brown-conrady" in fits:
         others.append(Fit.of(_bare(first, "brown-conrady"), views, Way(None), rejected))
     fine = [f for f in others if unsupported(f.model) is None and f.hold_out_px < fit.hold_out_px]
