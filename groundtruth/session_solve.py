@@ -103,7 +103,7 @@ class Solved:
     displaced: tuple[str, ...] = ()
     """Cameras that do not stand where the calibration has them; what was seen placed them."""
     tension: float = 1.0
-    """By how many standard deviations the cameras' places are still contradicted; deviations are as many times wider."""
+    """By how many standard deviations the other places are contradicted; deviations are as many times wider."""
 
 
 def solve_session(
