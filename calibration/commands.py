@@ -16,11 +16,11 @@ from calibration import store
 from calibration.drift import bumps
 from calibration.extrinsics import PlacedCameras, calibrate_cameras
 from calibration.hand_eye import calibrate_hand_eye
-from calibration.intrinsics import Lens, calibrate_intrinsics
+from calibration.intrinsics import Lens, as_good_alone, calibrate_intrinsics
 from calibration.pictures import residual_picture
 from calibration.report import Finding, Report
 from calibration.tag_faults import explain_absence
-from calibration.targets import Tags
+from calibration.targets import Tags, TargetView
 from calibration.views import (
     COLOR,
     TOGETHER_NS,
@@ -107,16 +107,18 @@ def _solved_together(session: Session, views: BoardViews, lenses: Mapping[str, L
         placed = calibrate_cameras(known, {n: views.board[n] for n in known}, reference, still, freed=fitted)
     except BadInput:
         return {}  # cameras that share no views: each has its own answer
-    return {n: _together_with(lenses[n], placed, n) for n in fitted}
+    return {n: _together_with(lenses[n], placed, n, views.board[n]) for n in fitted}
 
 
-def _together_with(lens: Lens, placed: PlacedCameras, name: str) -> Lens:
+def _together_with(lens: Lens, placed: PlacedCameras, name: str, views: Sequence[TargetView]) -> Lens:
+    """The lens of all cameras' views, where it explains this camera's own as well as its own lens does."""
     change = 100 * (placed.models[name].fx / lens.model.fx - 1)
-    note = Finding(
-        "note", f"{name}: solved with all cameras' views together, which moved the focal length {change:+.2f} %"
-    )
-    report = replace(lens.report, findings=(*lens.report.findings, note))
-    return replace(lens, model=placed.models[name], report=report)
+    taken = as_good_alone(lens, placed.models[name], views)
+    text = f"{name}: solved with all cameras' views together, which moved the focal length {change:+.2f} %"
+    if not taken:
+        text = f"{name}: solved with all cameras' views together, its own views would be explained worse: not taken"
+    report = replace(lens.report, findings=(*lens.report.findings, Finding("note", text)))
+    return replace(lens, model=placed.models[name] if taken else lens.model, report=report)
 
 
 def _picture(session: Session, kind: str, views: BoardViews, solved: Mapping[str, Lens]) -> Path:

@@ -71,7 +71,8 @@ def calibrate_cameras(
     does, so they give the scale, and the board's own is found: a printer is off by a part in a thousand easily. Tags
     that do not lie where they are said to are left out, and the report says so. `lenses_free`: the lenses are solved
     with the places, and taken where they explain views kept aside better than the given ones do; `freed`: those of
-    these cameras are, and are taken in any case. `models` of the result holds them.
+    these cameras are, on the board as it is laid out (a bent board moves focal lengths otherwise), and are taken in any
+    case. `models` of the result holds them.
     Raises BadInput where the geometry does not connect the cameras, naming those that are cut off.
     """
     names = [reference, *sorted(n for n in models if n != reference)]
@@ -81,7 +82,10 @@ def calibrate_cameras(
     hold_out = _hold_out(setup, solved)
     if lenses_free or freed:
         free = np.isin(names, freed) if freed else np.ones(len(names), dtype=bool)
-        without = adjust(replace(solved.scene, free_lenses=free), seen)
+        start = replace(solved.scene, free_lenses=free)
+        if freed:
+            start = replace(start, shift_m=np.zeros_like(start.shift_m), print_m=None)
+        without = adjust(start, seen)
         hold_out_without = _hold_out(setup, without)
         given_px, freed_px = hold_out["rms_px"], hold_out_without["rms_px"]
         if freed or given_px > AS_GOOD * freed_px:

@@ -21,6 +21,10 @@ NOT_TURNED = 1e-3
 """R R^T may differ from 1 by this."""
 CORNER_SIGMA_PX = 0.1
 """Of a chessboard's corner: OpenCV gives none."""
+CORNER_WINDOW = 0.35
+"""Half the window in which a corner is refined, as a share of the smallest distance to a neighbour in the image: on
+real boards .2 scatters more, .5 is no better and reaches the next corner sooner."""
+WINDOW_PX = (2, 12)
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,7 +163,22 @@ def _find_chessboard(target: Chessboard, image: UInt8[Array, "h w"]) -> TargetVi
         return NOTHING
     y, x = np.divmod(np.arange(target.columns * target.rows), target.columns)
     points_m = target.square_m * np.stack([x, y, np.zeros_like(x)], -1).astype(np.float64)
-    return TargetView(np.arange(len(x)), points_m, pixels.reshape(-1, 2).astype(np.float64), _plain(len(x)))
+    shape = (target.rows, target.columns, 2)
+    return TargetView(np.arange(len(x)), points_m, _refined(image, pixels.reshape(shape)), _plain(len(x)))
+
+
+def _refined(image: UInt8[Array, "h w"], pixels: Float[Array, "r c 2"]) -> Float[Array, "n 2"]:
+    """Corners moved to where the grey values' gradients point to (Foerstner 1987). What the sector-based detector finds
+    is pulled along by perspective: by .1 px, which is 1 % in focal length (25 real pairs of views). A corner that moves
+    by more than its window was drawn to another one and stays."""
+    import cv2
+
+    gaps = np.concatenate([np.linalg.norm(np.diff(pixels, axis=axis), axis=-1).ravel() for axis in (0, 1)])
+    half = int(np.clip(round(CORNER_WINDOW * float(gaps.min())), *WINDOW_PX))
+    start = np.ascontiguousarray(pixels.reshape(-1, 1, 2), dtype=np.float32)
+    moved = cv2.cornerSubPix(image, start.copy(), (half, half), (-1, -1), (3, 60, 1e-4))
+    stays = np.linalg.norm(moved - start, axis=-1, keepdims=True) > half
+    return np.where(stays, start, moved).reshape(-1, 2).astype(np.float64)
 
 
 def _plain(count: int) -> Float[Array, "n 2 2"]:

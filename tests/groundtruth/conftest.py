@@ -82,10 +82,11 @@ def lab(
     bumped: tuple[str, int, Transform] | None = None,
     blind: tuple[str, int] | None = None,
     cameras: tuple[str, ...] = ("mono0", "mono1", "mono2"),
+    seed: int = 0,
 ) -> TossLab:
-    """`late_ns`: how much later a camera exposes; `bumped`: a camera moved in its own frame from a toss on; `blind`: a
-    camera that misses every so many-th frame."""
-    random, layout = np.random.default_rng(0), cube_layout()
+    """`seed`: of the corners' noise and the tosses. `late_ns`: how much later a camera exposes; `bumped`: a camera
+    moved in its own frame from a toss on; `blind`: a camera that misses every so many-th frame."""
+    random, layout = np.random.default_rng(seed), cube_layout()
     places = {"mono0": [0.9, -0.6, 0.7], "mono1": [-0.9, -0.6, 0.8], "mono2": [0.0, 0.9, 0.9]}
     looks = {n: looking_at(np.array(places[n]), np.array([0.0, 0.0, 0.15])) for n in cameras}
     K = np.array([[900.0, 0, 640], [0, 900.0, 480], [0, 0, 1]])
@@ -99,7 +100,7 @@ def lab(
     seen, stamps, truth, flies = [], {}, {}, {}
     for toss in range(tosses):
         start = toss * 10_000_000_000
-        truth[toss], flies[toss] = toss_poses(toss, frames)
+        truth[toss], flies[toss] = toss_poses(toss + 1000 * seed, frames)
         stamps[toss] = {}
         for n in cameras:
             look = looks[n]

@@ -148,6 +148,31 @@ def test_a_bumped_camera_is_named_with_its_toss(toss_lab):
     assert found.moved[("mono1", 2)][1] > 3 * found.moved[("mono1", 0)][1]
 
 
+@pytest.mark.parametrize(
+    ("camera", "axis", "seed"), [("mono0", 1, 0), ("mono1", 0, 0), ("mono2", 2, 0), ("mono0", 0, 5), ("mono1", 1, 6)]
+)
+def test_a_bump_of_3_mm_in_the_only_toss_is_named_or_the_stated_deviation_covers_it(toss_lab, camera, axis, seed):
+    bump = Transform("camera", "camera", np.eye(3), 0.003 * np.eye(3)[axis])
+    made = toss_lab(tosses=1, bumped=(camera, 0, bump), seed=seed)
+    found, verdict = solved(made)
+    named = any(w.startswith(camera) and "bumped" in w for w in verdict.warnings)
+    assert found.displaced == ((camera,) if named else ())
+    track = found.tracks[0]
+    tag = min(found.layout)
+    placed = track.world_from_tagged @ found.layout[tag] @ np.linalg.inv(made.layout[tag])
+    off_m = np.sqrt(((placed - made.truth[0])[:, :3, 3] ** 2).sum(axis=1).mean())
+    stated_m = np.sqrt(np.einsum("nii->n", track.covariance[:, 3:, 3:]).mean())
+    assert off_m < (2 if named else 1) * stated_m
+    assert stated_m < 0.002
+
+
+@pytest.mark.parametrize("seed", [0, 5, 6])
+def test_no_camera_of_a_single_toss_is_called_bumped_where_none_was(toss_lab, seed):
+    found, verdict = solved(toss_lab(tosses=1, seed=seed))
+    assert not found.displaced
+    assert not any("bumped" in w for w in verdict.warnings)
+
+
 def test_a_wrong_tag_size_is_found_and_the_right_one_told(made):
     body = frozenset(range(6))
     measured = measured_sizes_m(triangulated_tags(made.sightings, made.calibration), body)

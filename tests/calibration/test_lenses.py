@@ -1,0 +1,109 @@
+"""What a lens may be, and what real boards say: detection, choice of the model, limits of the coefficients."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from calibration.intrinsics import calibrate_intrinsics
+from calibration.lens_fit import solve_lens
+from calibration.lens_support import unsupported
+from calibration.targets import Chessboard, find_target
+from recordings.geometry import CameraModel
+
+BOARD = Chessboard(9, 6, 0.03)
+SIZE = (640, 512)
+ZED = np.array([[697.9, 0, 633.0], [0, 697.9, 369.3], [0, 0, 1]])
+K = np.array([[518.0, 0, 320], [0, 518.0, 256], [0, 0, 1]])
+
+
+def picture(camera_from_board, over=4, blur_px=0.8):
+    """A chessboard as a camera sees it: `over` x `over` rays a pixel, a lens's blur, some noise."""
+    width, height = SIZE
+    u, v = np.meshgrid(*((np.arange(n * over) + 0.5) / over - 0.5 for n in SIZE))
+    board_from_pixel = np.linalg.inv(K @ camera_from_board[:3, [0, 1, 3]])
+    ray = np.einsum("ij,jhw->ihw", board_from_pixel, np.stack([u, v, np.ones_like(u)]))
+    x, y = (np.floor(ray[axis] / ray[2] / BOARD.square_m) for axis in (0, 1))
+    black = (x >= -1) & (x < BOARD.columns) & (y >= -1) & (y < BOARD.rows) & ((x + y) % 2 == 1)
+    grey = cv2.GaussianBlur(np.where(black, 40.0, 200.0), (0, 0), blur_px * over)
+    grey = grey.reshape(height, over, width, over).mean(axis=(1, 3))
+    return (grey + 1.5 * np.random.default_rng(0).normal(size=grey.shape)).clip(0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize("turn", [[0.6, 0.0, 0.1], [0.0, 0.7, 0.3], [0.5, -0.5, 1.0]])
+def test_corners_of_a_tilted_chessboard_are_not_pulled_along_by_perspective(turn):
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = Rotation.from_rotvec(turn).as_matrix(), [-0.12, -0.07, 0.7]
+    (view,) = find_target(BOARD, [picture(pose)])
+    wanted = (view.points_m @ pose[:3, :3].T + pose[:3, 3]) @ K.T
+    gap = view.pixels - wanted[:, :2] / wanted[:, 2:]
+    assert np.sqrt((gap**2).mean()) < 0.05
+
+
+@pytest.mark.parametrize(
+    ("kind", "numbers", "said"),
+    [
+        ("brown-conrady", (-0.6, 0.0, 0.0, 0.0, 0.0), "folds over at"),
+        ("brown-conrady", (-0.06, 0.19, 0.0, 0.0, -0.17), None),
+        ("rational", (2.8, 103.7, 0.0, 0.0, 50.7, 2.8, 104.8, 50.3), "drawn to noise"),
+        ("rational", (0.3, -0.1, 0.0, 0.0, 0.01, 0.6, -0.15, 0.0), None),
+        ("fisheye", (0.05, -0.02, 0.0, 0.0), None),
+        ("none", (), None),
+    ],
+)
+def test_a_lens_that_folds_over_or_is_made_of_cancelling_terms_is_unsupported(kind, numbers, said):
+    why = unsupported(CameraModel("mono0", *SIZE, K, kind, numbers))
+    assert why is None if said is None else said in why
+
+
+def test_a_lens_that_folds_over_only_where_nothing_was_seen_is_supported_there():
+    lens = CameraModel("hand", 1280, 720, ZED, "brown-conrady", (-0.1795, 0.0444, 3e-4, 8e-4, -0.0188))
+    assert "folds over at" in unsupported(lens)
+    assert unsupported(lens, np.array([[100.0, 360.0], [1200.0, 100.0]])) is None
+
+
+@pytest.fixture(scope="module")
+def noisy_views(geometry):
+    """A board in the middle of the image, seen by a lens with little distortion: nothing tells a rational one."""
+    rng = np.random.default_rng(2)
+    true = geometry.camera("mono0", 620.0, distortion_model="brown-conrady", distortion=(-0.06, 0.08, 0.0, 0.0, 0.0))
+    return [geometry.view(true, geometry.tilted(rng, (0.5, 0.8), 0.05), rng) for _ in range(12)]
+
+
+def test_a_lens_drawn_to_noise_is_refused_and_never_chosen_where_another_will_do(noisy_views):
+    asked = calibrate_intrinsics("mono0", (640, 480), noisy_views, ("rational",))
+    assert unsupported(asked.model) is not None
+    assert asked.report.verdict == "refused"
+    assert any("ask for a simpler lens" in reason for reason in asked.report.reasons())
+    free = calibrate_intrinsics("mono0", (640, 480), noisy_views)
+    assert unsupported(free.model) is None
+    assert free.report.verdict != "refused"
+    assert "rational" in free.report.details["unsupported"]
+
+
+def opencv_lens(views, size):
+    points, pixels = ([getattr(v, part).astype(np.float32) for v in views] for part in ("points_m", "pixels"))
+    near = np.array([[600.0, 0, size[0] / 2], [0, 600.0, size[1] / 2], [0, 0, 1]])  # the board is not flat: a start
+    _, matrix, bend, *_ = cv2.calibrateCamera(points, pixels, size, near, None, flags=cv2.CALIB_USE_INTRINSIC_GUESS)
+    return CameraModel("mono0", *size, matrix, "brown-conrady", tuple(bend.ravel().tolist()))
+
+
+def rms_px(model, views):
+    return float(np.sqrt((solve_lens(model, views, range(len(views)), free_lens=False)[0].residual_px ** 2).mean()))
+
+
+@pytest.mark.parametrize("seed", [0, 2])
+def test_views_never_seen_are_explained_as_well_as_by_plain_opencv(geometry, seed):
+    """With corners of which some are wrong by pixels, and a lens that bends by as much as the noise."""
+    rng = np.random.default_rng(seed)
+    bend = (-0.05 * seed, 0.03 * seed, 0.0, 0.0, 0.0)
+    true = geometry.camera("mono0", 620.0, distortion_model="brown-conrady", distortion=bend)
+    views = [geometry.view(true, geometry.tilted(rng, (0.35, 0.6), 0.12), rng) for _ in range(20)]
+    known, fresh = views[:10], views[10:]
+    known = [replace(v, pixels=v.pixels + 2.0 * (rng.random((len(v), 1)) < 0.01)) for v in known]
+    ours = calibrate_intrinsics("mono0", (640, 480), known).model
+    assert rms_px(ours, fresh) <= 1.01 * rms_px(opencv_lens(known, (640, 480)), fresh)
