@@ -45,8 +45,8 @@ class SolveConfig:
     """A camera is taken to stand elsewhere than calibrated when what was seen contradicts its place by as many standard
     deviations (root of the mean square over the directions that were seen); tags and other cameras then place it.
     Of 446 simulated one-toss sessions (tools/bench_bumps.py) it is chosen on one half for 2 % false alarms. On the
-    other half 5 of 75 unbumped sessions name a camera; of bumps by 1-2, 2-3, 3-4, 4-6 mm 37, 48, 94, 100 % are named; poses
-    are within two stated deviations in 97 % or more of the sessions of every kind."""
+    other half 5 of 75 unbumped sessions name a camera; of bumps by 1-2, 2-3, 3-4, 4-6 mm 37, 48, 94, 100 % are named;
+    poses are within two stated deviations in 97 % or more of the sessions of every kind."""
     loose_factor: float = 50.0
     """Its place in the calibration then counts with as many times its standard deviation."""
     drift_sigma: tuple[float, float] = (0.0005, 0.0003)
