@@ -15,15 +15,15 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from acquisition.clock import SessionClock
+from acquisition.arm.throw import Thrower
 from acquisition.interrupts import Interrupts
 from acquisition.operator import Keyboard, Nobody, Operator, Unattended, single_keys
 from acquisition.preflight import Preflight, of_recording, preflight
-from acquisition.recorder import Recorder
 from acquisition.rig import Rig
 from acquisition.run import Options, SessionReport, SessionRun
 from acquisition.setup import Setup, set_up
-from acquisition.throw import Thrower
+from acquisition.streaming.clock import SessionClock
+from acquisition.streaming.recorder import Recorder
 from recordings.console import DONE, FELL_SHORT, Outcome, progress_for
 from recordings.errors import BadInput
 from recordings.session_resume import next_toss, resume_session
@@ -53,7 +53,7 @@ def run(args: argparse.Namespace) -> Outcome:
     with Interrupts() as interrupts, single_keys(sys.stdin):
         report, checks = _record(args, setup, out, operator, interrupts)
     if setup.lab is not None and report.takes:
-        from acquisition.synthetic.beside import write_beside
+        from acquisition.synthetic.truth_sidecar import write_beside
 
         write_beside(setup.lab, out)
     return outcome(report, checks)
@@ -115,7 +115,7 @@ def the_operator(setup: Setup, args: argparse.Namespace) -> Operator:
     """Who is asked. Raises BadInput for an arm that would move without anybody, before anything is opened."""
     moves = setup.moves_arm and not args.calibration
     if moves:
-        from acquisition.arm_thrower import safe_to_move
+        from acquisition.arm.thrower import safe_to_move
 
         safe_to_move(setup.rig, setup.calibration)
     if not args.yes:
@@ -190,7 +190,7 @@ def make_thrower(setup: Setup, recorder: Recorder | None, operator: Operator, sp
     """The simulated lab's own, the arm of a rig with [toss], or a person's hand."""
     if not setup.moves_arm:
         return setup.thrower
-    from acquisition.arm_thrower import real_thrower
+    from acquisition.arm.thrower import real_thrower
 
     return real_thrower(setup.rig, setup.calibration, recorder, operator, speed)
 
@@ -254,7 +254,7 @@ def new_clock(out: Path) -> SessionClock:
 
 
 def _last_ns(path: Path) -> int:
-    from recordings.mcap_file import McapFile
+    from recordings.mcap.file import McapFile
 
     try:
         with McapFile(path) as file:

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt16
 from numpy import ndarray as Array
 
-from acquisition.toss_limits import ArmModel
+from acquisition.arm.limits import ArmModel
 from recordings.geometry import CameraModel, Transform
 from recordings.records import TossEvent
 

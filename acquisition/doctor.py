@@ -11,7 +11,7 @@ from pathlib import Path
 
 from acquisition.drivers import usb
 from acquisition.preflight import Preflight, Row
-from acquisition.streams import READS
+from acquisition.streaming.streams import READS
 from recordings.errors import DeviceNotFound
 from recordings.system_libraries import advice
 

@@ -16,9 +16,9 @@ from jaxtyping import Float
 from numpy import ndarray as Array
 
 from acquisition.devices import Image, RgbdCamera
-from acquisition.recorder import Recorder
 from acquisition.run import expected_bytes_s
-from acquisition.streams import Tally
+from acquisition.streaming.recorder import Recorder
+from acquisition.streaming.streams import Tally
 from recordings.tracks import RigCalibration
 
 State = Literal["ok", "warning", "fail"]
@@ -211,7 +211,7 @@ def _grain(recorder: Recorder) -> dict[str, float]:
 
 def tags(recorder: Recorder, calibration: RigCalibration) -> Iterator[Row]:
     """AprilTags in every picture; those of the table where the calibration says (else a camera was moved)."""
-    from calibration.tags import TagDetection, detect_tags
+    from calibration.tags.detect import TagDetection, detect_tags
 
     found_in: dict[str, list[TagDetection]] = {}
     for greys in of_one_size(greys_of(recorder)):

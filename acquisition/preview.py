@@ -6,7 +6,7 @@ import threading
 from types import TracebackType
 from typing import Any
 
-from acquisition.recorder import Recorder
+from acquisition.streaming.recorder import Recorder
 
 EVERY_S = 0.2
 WIDEST_PX = 480
@@ -16,7 +16,7 @@ class Preview:
     """Shows what a recorder receives for as long as it is open. Reads only what the recorder keeps anyway."""
 
     def __init__(self, recorder: Recorder, headless: bool = False) -> None:
-        from recordings.view_live import LiveView
+        from recordings.view.live import LiveView
 
         self._recorder = recorder
         self.view = LiveView(headless)

@@ -13,17 +13,17 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from acquisition.asked import count_down, stopped
+from acquisition.arm.asked import count_down, stopped
+from acquisition.arm.limits import arm_model
+from acquisition.arm.throw import Throw, Thrower
+from acquisition.arm.toss import TossPlan
 from acquisition.detect import Eye, TossEvents, TossWatcher
 from acquisition.devices import Arm, DeviceLost, DeviceRefused, Gripper
-from acquisition.gate import Trouble
 from acquisition.interrupts import Interrupts
 from acquisition.operator import Operator
-from acquisition.recorder import Recorder, look_stride
-from acquisition.streams import Tally
-from acquisition.throw import Throw, Thrower
-from acquisition.toss import TossPlan
-from acquisition.toss_limits import arm_model
+from acquisition.streaming.recorder import Recorder, look_stride
+from acquisition.streaming.sequence_check import Trouble
+from acquisition.streaming.streams import Tally
 from acquisition.verdict import Verdict, judge
 from recordings.errors import TosslabError, WriteFailed
 from recordings.progress import Progress

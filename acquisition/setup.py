@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from acquisition.arm.throw import ByHand, Thrower
 from acquisition.devices import Device
 from acquisition.rig import DeviceEntry, Rig, find_rig, from_table, read_rig
-from acquisition.throw import ByHand, Thrower
 from recordings.errors import BadInput
 from recordings.tracks import RigCalibration
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from typing import Literal
 
 from acquisition.detect import TossEvents
-from acquisition.gate import Trouble
 from acquisition.rig import RecordingConfig
-from acquisition.streams import Tally
+from acquisition.streaming.sequence_check import Trouble
+from acquisition.streaming.streams import Tally
 
 Decision = Literal["accept", "reject", "redo"]
 FATAL_KINDS = {

@@ -16,11 +16,11 @@ from acquisition.devices import Image
 from acquisition.interrupts import Interrupts
 from acquisition.operator import Operator
 from acquisition.preflight import of_one_size
-from acquisition.recorder import Recorder
 from acquisition.run import SessionReport
 from acquisition.setup import Setup
+from acquisition.streaming.recorder import Recorder
 from acquisition.synthetic.board import board_tags
-from calibration.targets import Target, TargetView, find_target, target_from_document
+from calibration.cameras.targets import Target, TargetView, find_target, target_from_document
 from recordings.records import ArmStates, DepthImage, EncodedImage
 from recordings.session_writer import SessionWriter, TossWriter
 

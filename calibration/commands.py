@@ -13,14 +13,14 @@ from jaxtyping import Float
 from numpy import ndarray as Array
 
 from calibration import store
+from calibration.cameras.extrinsics import PlacedCameras, calibrate_cameras
+from calibration.cameras.intrinsics import Lens, as_good_alone, calibrate_intrinsics
+from calibration.cameras.targets import Tags, TargetView
 from calibration.drift import bumps
-from calibration.extrinsics import PlacedCameras, calibrate_cameras
 from calibration.hand_eye import calibrate_hand_eye
-from calibration.intrinsics import Lens, as_good_alone, calibrate_intrinsics
 from calibration.pictures import residual_picture
 from calibration.report import Finding, Report
-from calibration.tag_faults import explain_absence
-from calibration.targets import Tags, TargetView
+from calibration.tags.faults import explain_absence
 from calibration.views import (
     COLOR,
     TOGETHER_NS,
@@ -34,7 +34,7 @@ from calibration.views import (
 from recordings.errors import BadInput
 from recordings.geometry import DistortionModel, Transform
 from recordings.progress import Progress
-from recordings.robot import ArmPath, panda
+from recordings.robot.arm import ArmPath, panda
 from recordings.session import Session, Toss
 
 DEPTH_SIZE_OFF, DEPTH_SIZE_WRONG = 0.02, 0.05

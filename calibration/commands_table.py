@@ -12,8 +12,10 @@ from jaxtyping import Float, Float32
 from numpy import ndarray as Array
 
 from calibration import store
+from calibration.cameras.extrinsics import still_view
+from calibration.cameras.poses import inverse_poses
+from calibration.cameras.targets import Tags, TargetView, tag_view
 from calibration.commands import Done, done
-from calibration.extrinsics import still_view
 from calibration.ground_plane import (
     Gravity,
     Plane,
@@ -25,11 +27,9 @@ from calibration.ground_plane import (
     table_points,
 )
 from calibration.pictures import table_picture
-from calibration.poses import inverse_poses
-from calibration.tag_faults import explain_absence
-from calibration.tags import detect_tags
-from calibration.targets import Tags, TargetView, tag_view
-from calibration.toss_object import solve_toss
+from calibration.tags.detect import detect_tags
+from calibration.tags.faults import explain_absence
+from calibration.tags.toss_object import solve_toss
 from calibration.views import (
     COLOR,
     camera_from_rig,

@@ -11,13 +11,14 @@ import numpy as np
 from numpy import ndarray as Array
 
 from calibration import store
+from calibration.cameras.extrinsics import spread
+from calibration.cameras.poses import inverse_poses
+from calibration.cameras.targets import Tags, tag_view
 from calibration.commands import TOOL, Done, done
-from calibration.extrinsics import spread
 from calibration.pictures import offsets_picture, residual_picture
-from calibration.poses import inverse_poses
 from calibration.report import Finding, Report, limit
-from calibration.tagged_object import TaggedObject, solve_tagged_object
-from calibration.targets import Tags, tag_view
+from calibration.tags.tagged_object import TaggedObject, solve_tagged_object
+from calibration.tags.toss_object import SolvedToss, solve_toss, tag_ids, tag_sizes, triggered
 from calibration.time_offset import (
     Path3,
     TimeOffset,
@@ -26,7 +27,6 @@ from calibration.time_offset import (
     offset_report,
     place_by_motion,
 )
-from calibration.toss_object import SolvedToss, solve_toss, tag_ids, tag_sizes, triggered
 from calibration.views import (
     COLOR,
     TossTags,
@@ -37,7 +37,7 @@ from calibration.views import (
 from recordings.errors import BadInput
 from recordings.geometry import Transform
 from recordings.progress import Progress
-from recordings.robot import ArmPath, panda
+from recordings.robot.arm import ArmPath, panda
 from recordings.session import Session, Toss
 from recordings.sync import clock_offset_ns
 

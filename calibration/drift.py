@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray as Array
 
+from calibration.cameras.targets import Tags, TargetView, tag_view
 from calibration.report import Finding, Level
-from calibration.tags import TagDetection
-from calibration.targets import Tags, TargetView, tag_view
+from calibration.tags.detect import TagDetection
 from recordings.tracks import RigCalibration
 
 OLD_S = 3600.0

@@ -18,12 +18,12 @@ import numpy as np
 from jaxtyping import Float, Float32
 from numpy import ndarray as Array
 
-from calibration.bundle import Observations, Scene, Solved, adjust
-from calibration.extrinsics import whitening
-from calibration.pnp import poses_of_points
-from calibration.poses import inverse_poses
+from calibration.cameras.bundle import Observations, Scene, Solved, adjust
+from calibration.cameras.extrinsics import whitening
+from calibration.cameras.pnp import poses_of_points
+from calibration.cameras.poses import inverse_poses
+from calibration.cameras.targets import TargetView
 from calibration.report import Finding, Report, limit
-from calibration.targets import TargetView
 from calibration.time_offset import GRAVITY_M_S2, Path3
 from recordings.errors import BadInput
 from recordings.geometry import CameraModel, Transform

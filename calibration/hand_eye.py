@@ -19,10 +19,10 @@ from numpy import ndarray as Array
 from scipy.linalg import sqrtm
 from scipy.spatial.transform import Rotation
 
-from calibration.extrinsics import LEAST_POINTS, board_pose, whitening
-from calibration.poses import angle_deg, exp_poses, inverse_poses, log_poses
+from calibration.cameras.extrinsics import LEAST_POINTS, board_pose, whitening
+from calibration.cameras.poses import angle_deg, exp_poses, inverse_poses, log_poses
+from calibration.cameras.targets import TargetView
 from calibration.report import Finding, Report, limit
-from calibration.targets import TargetView
 from recordings.errors import BadInput
 from recordings.geometry import CameraModel
 

@@ -16,11 +16,11 @@ from jaxtyping import Bool, Float
 from numpy import ndarray as Array
 from scipy.spatial.transform import Rotation, Slerp
 
-from calibration.extrinsics import whitening
-from calibration.pnp import most_agreed, poses_of_points
-from calibration.poses import exp_poses
+from calibration.cameras.extrinsics import whitening
+from calibration.cameras.pnp import most_agreed, poses_of_points
+from calibration.cameras.poses import exp_poses
+from calibration.cameras.targets import TargetView
 from calibration.report import Finding, Report, limit
-from calibration.targets import TargetView
 from recordings.errors import BadInput
 from recordings.geometry import CameraModel
 

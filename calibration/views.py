@@ -12,10 +12,10 @@ import numpy as np
 from jaxtyping import Float, Int64, UInt8
 from numpy import ndarray as Array
 
-from calibration.tags import Refinement, Response, TagDetection, detect_tags
-from calibration.targets import NOTHING, Tags, Target, TargetView, find_target, tag_view, target_from_document
-from recordings import codec
+from calibration.cameras.targets import NOTHING, Tags, Target, TargetView, find_target, tag_view, target_from_document
+from calibration.tags.detect import Refinement, Response, TagDetection, detect_tags
 from recordings.errors import BadInput
+from recordings.mcap import codec
 from recordings.progress import Progress
 from recordings.session import Frames, Session, Toss
 from recordings.tracks import RigCalibration

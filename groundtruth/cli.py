@@ -67,10 +67,10 @@ def _tagslam_parser() -> Any:
 
 
 def _work_tagslam(args: argparse.Namespace) -> Outcome:
-    from groundtruth.answer import answer_document, answer_text
-    from groundtruth.detections import read_recording
-    from groundtruth.tag_slam import run_tag_slam
-    from groundtruth.tagslam_config import read_config
+    from groundtruth.tagslam.answer import answer_document, answer_text
+    from groundtruth.tagslam.config import read_config
+    from groundtruth.tagslam.detections import read_recording
+    from groundtruth.tagslam.solve import run_tag_slam
     from recordings.session_writer import write_bytes
 
     if not args.folder.is_dir():

@@ -12,10 +12,10 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from numpy import ndarray as Array
 
-from calibration.tag_faults import explain_absence
-from calibration.tags import TagDetection, detect_tags
-from recordings.codec import decode_image
+from calibration.tags.detect import TagDetection, detect_tags
+from calibration.tags.faults import explain_absence
 from recordings.errors import BadInput
+from recordings.mcap.codec import decode_image
 from recordings.progress import Progress
 from recordings.session import Session, Toss
 from recordings.tracks import RigCalibration

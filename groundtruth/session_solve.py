@@ -18,12 +18,12 @@ from groundtruth import se3
 from groundtruth.factors import Between
 from groundtruth.flight import FlightConfig, Order, arcs_of, center_of_mass
 from groundtruth.graph import Graph, Solution, SolverConfig, Undetermined, covariances, solve
-from groundtruth.grow import Growth, chain
-from groundtruth.problem import Key, Observation, Problem, camera_key, planar_poses, tag_key
 from groundtruth.session_sightings import Roles, Sightings, TagSeen
-from groundtruth.tag_slam import TagSlamSettings, build_graph, grow
-from groundtruth.tagslam_config import BodyEntry, CameraEntry, TagEntry, TagSlamConfig
-from groundtruth.tagslam_yaml import NoisyPose
+from groundtruth.tagslam.config import BodyEntry, CameraEntry, TagEntry, TagSlamConfig
+from groundtruth.tagslam.initialisation import Growth, chain
+from groundtruth.tagslam.problem import Key, Observation, Problem, camera_key, planar_poses, tag_key
+from groundtruth.tagslam.solve import TagSlamSettings, build_graph, grow
+from groundtruth.tagslam.yaml_pieces import NoisyPose
 from groundtruth.tension import tension
 from recordings.progress import Progress, Silent
 from recordings.tracks import RigCalibration

@@ -16,7 +16,7 @@ from jaxtyping import Float, Int64
 from numpy import ndarray as Array
 
 from groundtruth import se3
-from groundtruth.answer import pose_rows, reprojection
+from groundtruth.d455_tags import Witness, WitnessConfig, witness
 from groundtruth.offset import Fit, object_from_tagged_by_mesh, tagged_frame
 from groundtruth.session_sightings import (
     assign_roles,
@@ -28,9 +28,9 @@ from groundtruth.session_sightings import (
     triangulated_tags,
 )
 from groundtruth.session_solve import Solved, solve_session
+from groundtruth.tagslam.answer import pose_rows, reprojection
 from groundtruth.toss_truth import TossTruth, TrackedLimits, at_color_frames
 from groundtruth.verdict import Verdict, judge
-from groundtruth.witness import Witness, WitnessConfig, witness
 from recordings.documents import json_object
 from recordings.errors import BadInput
 from recordings.geometry import Transform

@@ -12,12 +12,12 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from processing.weights import PUBLISHED, find_weights, fingerprint
+from processing.published_weights import PUBLISHED, find_weights, fingerprint
 from recordings.errors import BadInput
 
 if TYPE_CHECKING:
+    from processing.features.sift import FeatureMatcher
     from processing.segment.segmenter import Segmenter
-    from processing.track.features import FeatureMatcher
 
 SEGMENTERS = ("background", "xmem")
 MATCHERS = ("sift", "loftr", "xfeat", "lightglue")
@@ -59,7 +59,7 @@ def check(backends: Backends) -> None:
         if name in PUBLISHED:
             find_weights(PUBLISHED[name], backends.weights)
     if backends.matcher != MATCHERS[0] and find_spec("kornia") is None:
-        from processing.track.matchers import open_kornia
+        from processing.features.learned import open_kornia
 
         open_kornia(PUBLISHED[backends.matcher].option)
 
@@ -81,7 +81,7 @@ def make_segmenter(backends: Backends, background: Segmenter, device: str = "cpu
     _known("segmenter", backends.segmenter, SEGMENTERS)
     if backends.segmenter == "background":
         return background
-    from processing.segment.xmem import XMemSegmenter
+    from processing.segment.xmem.segmenter import XMemSegmenter
 
     return XMemSegmenter.from_weights(backends.weights, finder=background, device=device)
 
@@ -90,17 +90,17 @@ def make_matcher(backends: Backends, device: str = "cpu") -> FeatureMatcher:
     """The chosen matcher, with its weights loaded."""
     _known("matcher", backends.matcher, MATCHERS)
     if backends.matcher == "loftr":
-        from processing.track.matchers_loftr import Loftr
+        from processing.features.loftr import Loftr
 
         return Loftr.from_weights(backends.weights, device=device)
     if backends.matcher == "xfeat":
-        from processing.track.matchers_xfeat import XFeat
+        from processing.features.xfeat import XFeat
 
         return XFeat.from_weights(backends.weights, device=device)
     if backends.matcher == "lightglue":
-        from processing.track.matchers_lightglue import LightGlue
+        from processing.features.lightglue import LightGlue
 
         return LightGlue.from_weights(backends.weights, device=device)
-    from processing.track.features import Sift
+    from processing.features.sift import Sift
 
     return Sift()

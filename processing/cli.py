@@ -119,8 +119,8 @@ def _work(args: argparse.Namespace) -> Outcome:
 
 def _many(args: argparse.Namespace, sessions: Sequence[Path], name: str) -> Outcome:
     """Every session in a process of its own; one that fails does not stop the others. Then a table over all."""
+    from processing.evaluate.table import summary
     from processing.executor import Task, run_all
-    from processing.table import summary
 
     plain = {k: v for k, v in vars(args).items() if k != "work"}
     tasks = [Task(path.stem, _logs_of(args, path), (plain, path, name)) for path in sessions]
@@ -211,7 +211,7 @@ def _started(args: argparse.Namespace, run: Run) -> Run:
     """`--start truth`: the run with the first true pose of every toss."""
     if args.start is None:
         return run
-    from processing.truth import start_poses
+    from processing.evaluate.truth import start_poses
 
     starts = start_poses(args.truth, run.session, run.tosses, "d455")
     note = Notice("start", "high", "start: the first pose of every toss is the true one (--start truth)")
@@ -220,7 +220,7 @@ def _started(args: argparse.Namespace, run: Run) -> Run:
 
 def learned_shape_of(results_path: Path) -> Path:
     """The stage folder with the shape of a results folder: that of the best row that is there. Raises BadInput."""
-    from recordings.results import Results
+    from recordings.results.folder import Results
 
     results = Results.open(results_path)
     there = {name: results.find(name, scope) for name, scope in results.variants() if scope == "all"}
@@ -236,8 +236,8 @@ def learned_shape_of(results_path: Path) -> Path:
 def config_of(args: argparse.Namespace) -> Config:
     """The pipeline's settings that the command line asks for; everything else stays as it is by default."""
     from processing.config import Config
-    from processing.reprojected import RedrawConfig
-    from processing.second_pass import CycleConfig
+    from processing.refine.redrawn_frames import RedrawConfig
+    from processing.stages.second_pass import CycleConfig
 
     redraw = RedrawConfig(depth=args.redraw, occlusion=args.occlusion)
     cycle = CycleConfig(redraw=redraw, renderer=args.renderer, start=args.second_pass)
@@ -246,13 +246,13 @@ def config_of(args: argparse.Namespace) -> Config:
 
 def _evaluate(args: argparse.Namespace, session: Session, out: Path, run: Run) -> Outcome:
     """Scores of all variants in the results folder, table and report."""
-    from processing.floor import coverage_floor
-    from processing.report import write_report
-    from processing.score import score_variant, true_mesh
-    from processing.stage import locked
-    from processing.table import collect, markdown, write_table
-    from processing.truth import open_truth
-    from recordings.results import Results
+    from processing.evaluate.floor import coverage_floor
+    from processing.evaluate.report import write_report
+    from processing.evaluate.score import score_variant, true_mesh
+    from processing.evaluate.table import collect, markdown, write_table
+    from processing.evaluate.truth import open_truth
+    from processing.store import locked
+    from recordings.results.folder import Results
 
     results = Results.open(out)
     scores, mesh = {}, None

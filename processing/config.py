@@ -5,19 +5,19 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from processing.backends import Backends
-from processing.contact.from_tracks import TracksConfig
+from processing.baselines.frame_to_model import FrameToModelSettings
+from processing.contact.learn.from_tracks import TracksConfig
 from processing.field.learn import LearnConfig
 from processing.given_masks import DEFAULT_MASKS, GivenMasks
-from processing.joint import JointConfig
-from processing.rig import RigSettings
-from processing.second_pass import CycleConfig
-from processing.segment.follow import BackgroundSettings
-from processing.segment.sighting import FindSettings
-from processing.segment.static_scene import SceneSettings
-from processing.still import StillSettings
-from processing.track.frame_to_model import FrameToModelSettings
-from processing.track.register import RegisterConfig
-from processing.track.sequence import TrackConfig
+from processing.refine.joint import JointConfig
+from processing.segment.background.follow import BackgroundSettings
+from processing.segment.background.static_scene import SceneSettings
+from processing.segment.detect.detection import FindSettings
+from processing.sensor.still import StillSettings
+from processing.stages.rig import RigSettings
+from processing.stages.second_pass import CycleConfig
+from processing.track.registration.register import RegisterConfig
+from processing.track.track_toss import TrackConfig
 
 
 @dataclass(frozen=True)

@@ -15,34 +15,27 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from processing.backends import make_matcher, settings_of
+from processing.baselines.frame_to_model import FrameToModel
 from processing.config import Config
-from processing.cycle import Pass, alone_start, run_cycle
-from processing.dynamics import rollout_stage
-from processing.frames import corrected_frames
-from processing.lost_tosses import with_lost, without_lost
-from processing.masks import object_masks, scene_notes, static_scene
-from processing.one_shape import of_one_shape
-from processing.segment.static_scene import StaticScene
-from processing.stage import Counts, Done, Store, locked, plain
+from processing.segment.background.static_scene import StaticScene
+from processing.sensor.frames import corrected_frames
+from processing.sensor.still import Kept, in_every_frame, without_waiting
+from processing.sensor.table_plane import with_table_from_depth
 from processing.stage_notices import of_contact, of_run, of_track
+from processing.stages.contact import rollout_stage
+from processing.stages.cycle import Pass, alone_start, run_cycle
+from processing.stages.lost_tosses import with_lost, without_lost
+from processing.stages.masks import object_masks, scene_notes, static_scene
+from processing.stages.one_shape import of_one_shape
+from processing.stages.vision import CAMERA, field_stage, model_stage, model_track_stage, register_stage, track_stage
 from processing.start_pose import StartPose
-from processing.still import Kept, in_every_frame, without_waiting
-from processing.table_plane import with_table_from_depth
-from processing.track.frame_to_model import FrameToModel
+from processing.store import Counts, Done, Store, locked, plain
 from processing.variants import TRACKERS, WITH_MODEL, Variant
-from processing.vision import (
-    CAMERA,
-    field_stage,
-    model_stage,
-    model_track_stage,
-    register_stage,
-    track_stage,
-)
 from recordings.errors import BadInput
 from recordings.geometry import CameraModel
 from recordings.notices import Notice, in_order
 from recordings.progress import Progress
-from recordings.results import (
+from recordings.results.folder import (
     Scope,
     TossRecord,
     VariantRecord,
@@ -55,7 +48,7 @@ from recordings.session import RgbdFrames, Session
 from recordings.session_writer import file_sha256
 
 if TYPE_CHECKING:
-    from processing.track.features import FeatureMatcher
+    from processing.features.sift import FeatureMatcher
 
 MakeProgress = Callable[[str], Progress]
 
@@ -75,7 +68,7 @@ class Run:
     starts: Mapping[int, StartPose] = field(default_factory=dict)
     warnings: tuple[Notice, ...] = ()
     kept: Mapping[int, Kept] = field(default_factory=dict)
-    """Of tosses with long still stretches, the frames that are worked on: see processing.still."""
+    """Of tosses with long still stretches, the frames that are worked on: see processing.sensor.still."""
     lost: tuple[int, ...] = ()
     """Tosses in which the object is not seen: they show the scene and the robot only."""
 

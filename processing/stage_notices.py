@@ -7,9 +7,9 @@ import json
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
-from processing.rig import rig_stage
-from processing.stage import Done
-from recordings import arm_codec
+from processing.stages.rig import rig_stage
+from processing.store import Done
+from recordings.mcap import arm_codec
 from recordings.notices import Notice
 
 if TYPE_CHECKING:

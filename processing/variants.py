@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal
 from recordings.errors import BadInput
 
 if TYPE_CHECKING:
-    from recordings.results import Scope
+    from recordings.results.folder import Scope
 
 First = Literal["one_toss", "all_tosses"]
 Refined = Literal["contact", "cycle", "converged", "joint"]

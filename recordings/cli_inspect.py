@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from recordings.console import DONE, FELL_SHORT, Outcome, add_command, progress_for
 
 if TYPE_CHECKING:
-    from recordings.recover import Recovered
+    from recordings.mcap.recover import Recovered
 
 
 def add_commands(subparsers: Any) -> None:
@@ -44,14 +44,14 @@ def add_commands(subparsers: Any) -> None:
 
 
 def _info(args: argparse.Namespace) -> Outcome:
-    from recordings.inspect import inspect
+    from recordings.verify.inspect import inspect
 
     info = inspect(args.path)
     return Outcome(info.to_json(), info.to_text(), FELL_SHORT if info.damaged else DONE)
 
 
 def _verify(args: argparse.Namespace) -> Outcome:
-    from recordings.verify import verify
+    from recordings.verify.verify import verify
 
     report = verify(args.path, progress_for("verify"))
     return Outcome(report.to_json(), report.to_text(), DONE if report.ok else FELL_SHORT)

@@ -41,7 +41,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _work(args: argparse.Namespace) -> Outcome:
     _check_names(args)
-    from recordings import view
+    from recordings.view import draw as view
 
     choice = view.Choice(args.toss, args.variant, args.scope)
     started = time.monotonic()

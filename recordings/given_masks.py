@@ -7,8 +7,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from jaxtyping import Bool, Int64
 from numpy import ndarray as Array
 
-from recordings.codec import decode_mask
-from recordings.mcap_file import McapFile
+from recordings.mcap.codec import decode_mask
+from recordings.mcap.file import McapFile
 
 
 class GivenMasks(Mapping):  # not Mapping[int, Bool[Array, "h w"]]: type checks in tests would decode one at every call

@@ -11,12 +11,12 @@ from typing import Any
 
 from recordings.documents import as_dict, json_object, mapping, read_document
 from recordings.errors import BadInput, TosslabError, WriteFailed
-from recordings.mcap_file import McapFile
+from recordings.mcap.file import McapFile
+from recordings.mcap.recover import STOP, Recovered, recover_file
 from recordings.progress import Progress, Silent
-from recordings.recover import STOP, Recovered, recover_file
 from recordings.session_writer import FORMAT_VERSION, file_sha256, write_bytes, write_json
 from recordings.tracks import RigCalibration
-from recordings.verify_structure import check_structure
+from recordings.verify.structure import check_structure
 
 LEFT_BEHIND = ("results",)
 

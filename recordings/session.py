@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float32, Int64
 from numpy import ndarray as Array
 
-from recordings import arm_codec, codec, sync
+from recordings import sync
 from recordings.align import align_depth
 from recordings.documents import (
     FORMAT_VERSION,
@@ -26,7 +26,8 @@ from recordings.documents import (
 from recordings.errors import BadInput, DamagedFile
 from recordings.geometry import CameraModel
 from recordings.given_masks import GivenMasks
-from recordings.mcap_file import McapFile, Message
+from recordings.mcap import arm_codec, codec
+from recordings.mcap.file import McapFile, Message
 from recordings.records import (
     ArmStates,
     DepthImage,

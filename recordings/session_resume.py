@@ -6,11 +6,11 @@ from pathlib import Path
 
 from recordings.documents import as_dict, json_object, read_document
 from recordings.errors import BadInput
-from recordings.mcap_file import McapFile
-from recordings.recover import STOP, Recovered, recover_file
+from recordings.mcap.file import McapFile
+from recordings.mcap.recover import STOP, Recovered, recover_file
 from recordings.session_writer import FinishedFile, SessionWriter, file_sha256
 from recordings.tracks import RigCalibration
-from recordings.verify_structure import check_structure
+from recordings.verify.structure import check_structure
 
 CUT = ".cut"
 """Added to the name of a file that was cut off: its bytes stay beside the recovered file."""

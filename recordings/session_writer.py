@@ -19,11 +19,11 @@ from foxglove_schemas_protobuf.JointStates_pb2 import JointStates
 from jaxtyping import Bool
 from numpy import ndarray as Array
 
-from recordings import arm_codec, codec
 from recordings.documents import FORMAT_VERSION as FORMAT_VERSION
 from recordings.errors import BadInput, WriteFailed
 from recordings.geometry import Transform
-from recordings.mcap_writer import McapWriter
+from recordings.mcap import arm_codec, codec
+from recordings.mcap.writer import McapWriter
 from recordings.records import ArmStates, DepthImage, EncodedImage, HealthLine, StampedPose, TossCommand, TossEvent
 from recordings.tracks import RigCalibration
 

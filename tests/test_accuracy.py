@@ -14,12 +14,12 @@ import pytest
 import trimesh
 
 from processing.config import Config
-from processing.masks import object_masks, static_scene
 from processing.pipeline import start_run
-from processing.vision import track_stage
+from processing.stages.masks import object_masks, static_scene
+from processing.stages.vision import track_stage
 from recordings.importers.folder import import_folder
 from recordings.progress import Silent
-from recordings.results import read_track
+from recordings.results.folder import read_track
 from recordings.session import Session
 
 ROOT = Path(__file__).resolve().parent.parent

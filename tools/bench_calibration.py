@@ -25,10 +25,10 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from numpy import ndarray as Array
 
-from calibration.extrinsics import LEAST_POINTS, calibrate_cameras
-from calibration.intrinsics import Lens, calibrate_intrinsics
-from calibration.lens_fit import gain_by_chance, squares_aside
-from calibration.targets import Charuco, Chessboard, TargetView, find_target
+from calibration.cameras.extrinsics import LEAST_POINTS, calibrate_cameras
+from calibration.cameras.intrinsics import Lens, calibrate_intrinsics
+from calibration.cameras.lens_fit import gain_by_chance, squares_aside
+from calibration.cameras.targets import Charuco, Chessboard, TargetView, find_target
 from recordings.geometry import CameraModel
 
 SETS = Path(os.environ.get("TOSSLAB_CALIBRATION_SETS", Path.home() / ".cache" / "tosslab-calibration"))

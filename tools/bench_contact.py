@@ -21,14 +21,14 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np
 import torch
 
-from processing.contact.data_checks import duplicate_groups
-from processing.contact.evaluate import evaluate
-from processing.contact.from_tracks import learn_from_series
-from processing.contact.inertia import Physics, known_physics, uniform_physics
-from processing.contact.learn import ContactLearning, learn_contact
-from processing.contact.motion import PoseSeries, rotation_matrices
-from processing.contact.plane import Plane
-from processing.contact.prior import Prior, prior_from_shape, prior_from_size
+from processing.contact.learn.data_checks import duplicate_groups
+from processing.contact.learn.from_tracks import learn_from_series
+from processing.contact.learn.learn import ContactLearning, learn_contact
+from processing.contact.learn.prior import Prior, prior_from_shape, prior_from_size
+from processing.contact.physics.inertia import Physics, known_physics, uniform_physics
+from processing.contact.physics.plane import Plane
+from processing.contact.report.rollout_errors import evaluate
+from processing.motion.trajectory import PoseSeries, rotation_matrices
 from recordings.tracks import ObjectShape
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -19,14 +19,14 @@ from pathlib import Path
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 from processing.config import Config
+from processing.evaluate.score import VariantScore, score_variant
+from processing.evaluate.table import COLUMNS
+from processing.evaluate.truth import open_truth
 from processing.pipeline import process, start_run
-from processing.score import VariantScore, score_variant
-from processing.table import COLUMNS
-from processing.truth import open_truth
 from processing.variants import BEYOND, TABLE, find_variant
 from recordings.importers.folder import import_folder
 from recordings.progress import Silent
-from recordings.results import Results
+from recordings.results.folder import Results
 from recordings.session import Session
 
 DATA = Path(os.environ.get("TOSSLAB_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
@@ -99,7 +99,7 @@ def run_row(session: Session, tosses: Sequence[int], truth: Path, out: Path, nam
 
 def worst(score: VariantScore) -> str:
     """The toss with the lowest area under its ADD curve."""
-    from processing.score import pose_values
+    from processing.evaluate.score import pose_values
 
     each = {t.toss: pose_values(t.errors, "")["add_auc"].value for t in score.tosses}
     low = min(each, key=lambda t: each[t])

@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from acquisition.devices import Arm, DeviceLost, JointTrajectory, MonoCamera, RgbdCapture
-from acquisition.simulators.apart import Apart
+from acquisition.simulators.child_process import Apart
 
 SWING_S = 1.2
 SWING_RAD = {7: [0.3, 0.5, 0.0, 0.7, 0.0, 0.4, 0.0], 6: [0.3, 0.4, 0.0, 0.6, 0.0, 0.3]}

@@ -25,12 +25,12 @@ import numpy as np
 import torch
 import trimesh
 
+from processing.evaluate.metrics import chamfer, icp_align, surface_points
 from processing.field.fuse import fuse
 from processing.field.learn import LearnConfig
 from processing.field.mesh import extract_mesh, grid_mesh
 from processing.field.train import FieldConfig, train_field
 from processing.field.views import FieldView, make_view
-from processing.metrics import chamfer, icp_align, surface_points
 from recordings.geometry import CameraModel
 from recordings.importers.folder import import_folder
 from recordings.session import Session

@@ -18,11 +18,11 @@ from dataclasses import dataclass
 import numpy as np
 from bench_contact import CUBE, any_body, held, line, noisy, recorded_once, run_cases, simulated, toss
 
-from processing.contact import friction as slow_friction
-from processing.contact import intervals
-from processing.contact.inertia import uniform_physics
-from processing.contact.learn import ContactConfig, ContactLearning, learn_contact
-from processing.contact.prior import prior_from_size
+from processing.contact.friction import estimate as slow_friction
+from processing.contact.learn import intervals
+from processing.contact.learn.learn import ContactConfig, ContactLearning, learn_contact
+from processing.contact.learn.prior import prior_from_size
+from processing.contact.physics.inertia import uniform_physics
 from recordings.errors import BadInput
 from recordings.tracks import ObjectShape
 

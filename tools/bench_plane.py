@@ -13,14 +13,14 @@ from collections.abc import Sequence
 import numpy as np
 from bench_contact import CUBE, block, l_mesh, line, noisy, prism, recorded_once, run_cases, simulated, there, toss
 
-from processing.contact import data_checks as checks
-from processing.contact.geometry import CORNERS
-from processing.contact.inertia import uniform_physics
-from processing.contact.learn import ContactConfig, learn_contact
-from processing.contact.motion import PoseSeries
-from processing.contact.prior import prior_from_size
-from processing.contact.segment import find_phases
-from processing.contact.touch import TouchedPlane, plane_by_touch
+from processing.contact.learn import data_checks as checks
+from processing.contact.learn.learn import ContactConfig, learn_contact
+from processing.contact.learn.prior import prior_from_size
+from processing.contact.learn.touch import TouchedPlane, plane_by_touch
+from processing.contact.physics.geometry import CORNERS
+from processing.contact.physics.inertia import uniform_physics
+from processing.motion.phases import find_phases
+from processing.motion.trajectory import PoseSeries
 from recordings.errors import BadInput
 from recordings.tracks import ObjectShape
 

@@ -37,30 +37,23 @@ import numpy as np
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
-from acquisition.clock import ClockMapper, SessionClock  # noqa: E402
+from acquisition.arm.limits import arm_model  # noqa: E402
+from acquisition.arm.toss import ReleaseDelay, Samples, TossRefused, check_limits, draw_target, plan_toss
+from acquisition.arm.workspace import Space  # noqa: E402
 from acquisition.detect import Eye, TossWatcher  # noqa: E402
 from acquisition.drivers.synthetic import SyntheticConfig, SyntheticLab, SyntheticThrower  # noqa: E402
 from acquisition.operator import Nobody  # noqa: E402
-from acquisition.recorder import Recorder  # noqa: E402
 from acquisition.rig import DeviceEntry, RecordingConfig, Rig, TossConfig  # noqa: E402
 from acquisition.run import Options, SessionRun  # noqa: E402
-from acquisition.toss import (  # noqa: E402
-    ReleaseDelay,
-    Samples,
-    TossRefused,
-    check_limits,
-    draw_target,
-    plan_toss,
-)
-from acquisition.toss_limits import arm_model  # noqa: E402
+from acquisition.streaming.clock import ClockMapper, SessionClock  # noqa: E402
+from acquisition.streaming.recorder import Recorder  # noqa: E402
 from acquisition.verdict import Verdict  # noqa: E402
-from acquisition.workspace import Space  # noqa: E402
 from recordings.geometry import Transform, rotation_exp  # noqa: E402
 from recordings.progress import Silent  # noqa: E402
 from recordings.session import Session  # noqa: E402
 from recordings.session_resume import next_toss, resume_session  # noqa: E402
 from recordings.session_writer import SessionWriter, file_sha256  # noqa: E402
-from recordings.verify import verify  # noqa: E402
+from recordings.verify.verify import verify  # noqa: E402
 
 LAB = SyntheticConfig(pictures="pool", color_size=(848, 480), mono_size=(1440, 1080))
 TINY = SyntheticConfig(pictures="pool", color_size=(212, 120), mono_size=(160, 120), mono_cameras=1)
@@ -300,7 +293,7 @@ def lab_toml(wrong: dict[str, Any]) -> str:
 def bench_times(part: str) -> bool:
     """A toss of each lab, recorded, calibrated by its own motion, compared with the simulation's exposures."""
     from acquisition.cli import main as toss_record
-    from acquisition.synthetic.beside import stamp_errors_ms
+    from acquisition.synthetic.truth_sidecar import stamp_errors_ms
     from calibration.cli import main as toss_calibrate
 
     good = True
@@ -438,7 +431,7 @@ def bench_tags() -> bool:
     from acquisition.synthetic.config import MonoConfig
     from acquisition.synthetic.lab import Lab
     from acquisition.synthetic.show import scene_config
-    from calibration.tags import detect_tags
+    from calibration.tags.detect import detect_tags
 
     config = SyntheticConfig(seed=5)
     scene = scene_config(config)

@@ -37,10 +37,10 @@ from foxglove_schemas_protobuf.RawImage_pb2 import RawImage  # noqa: E402
 from mcap.reader import make_reader  # noqa: E402
 from mcap.writer import Writer as PlainWriter  # noqa: E402
 
-from recordings.codec import decode_image, schema_descriptor  # noqa: E402
-from recordings.depth_codec import pack_depth, unpack_depth  # noqa: E402
 from recordings.geometry import CameraModel  # noqa: E402
-from recordings.mcap_writer import CHUNK_BYTES, CHUNK_NS  # noqa: E402
+from recordings.mcap.codec import decode_image, schema_descriptor  # noqa: E402
+from recordings.mcap.depth_codec import pack_depth, unpack_depth  # noqa: E402
+from recordings.mcap.writer import CHUNK_BYTES, CHUNK_NS  # noqa: E402
 from recordings.records import ArmStates, DepthImage, EncodedImage  # noqa: E402
 from recordings.recover_session import recover  # noqa: E402
 from recordings.schemas.tosslab_pb2 import DepthImage as DepthMessage  # noqa: E402

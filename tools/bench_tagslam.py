@@ -19,12 +19,12 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from groundtruth.detections import Recording, read_recording
 from groundtruth.graph import Undetermined
 from groundtruth.session_truth import TruthConfig, find_truth
-from groundtruth.tag_slam import TagSlamResult, run_tag_slam
-from groundtruth.tagslam_config import TagSlamConfig, read_config
-from groundtruth.tagslam_yaml import NoisyPose
+from groundtruth.tagslam.config import TagSlamConfig, read_config
+from groundtruth.tagslam.detections import Recording, read_recording
+from groundtruth.tagslam.solve import TagSlamResult, run_tag_slam
+from groundtruth.tagslam.yaml_pieces import NoisyPose
 from recordings.session import Session
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -177,7 +177,7 @@ def _processed(imported: Path, truth: Path, out: Path, options: Sequence[str]) -
 
 
 def _warnings(out: Path) -> list[str]:
-    from recordings.results import Results
+    from recordings.results.folder import Results
 
     return [notice.text for notice in Results.open(out).find().warnings]
 

@@ -29,15 +29,28 @@ import cv2
 import numpy as np
 import trimesh
 
+from processing.baselines.frame_to_model import FrameToModel
+from processing.evaluate.metrics import (
+    FrameErrors,
+    align_first,
+    auc_percent,
+    chamfer,
+    frame_errors,
+    icp_align,
+    surface_points,
+)
 from processing.field.learn import LearnConfig, TossViews, learn_shape
-from processing.metrics import FrameErrors, align_first, auc_percent, chamfer, frame_errors, icp_align, surface_points
-from processing.segment.background import BackgroundSegmenter
-from processing.segment.follow import BackgroundSettings
+from processing.segment.background.follow import BackgroundSettings
+from processing.segment.background.segmenter import BackgroundSegmenter
+from processing.segment.background.static_scene import (
+    SceneSettings,
+    calibrated_table_depth,
+    learn_scene,
+    sample_positions,
+)
 from processing.segment.segmenter import Example
-from processing.segment.static_scene import SceneSettings, calibrated_table_depth, learn_scene, sample_positions
-from processing.track.frame_to_model import FrameToModel
-from processing.track.register import register_tosses
-from processing.track.sequence import TossTrack, track_toss
+from processing.track.registration.register import register_tosses
+from processing.track.track_toss import TossTrack, track_toss
 from recordings.geometry import rotation_log
 from recordings.importers.folder import import_folder
 from recordings.progress import Silent

@@ -18,8 +18,8 @@ import numpy as np
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
-from recordings.codec import decode_image  # noqa: E402
 from recordings.geometry import CameraModel, Transform, rotation_exp  # noqa: E402
+from recordings.mcap.codec import decode_image  # noqa: E402
 from recordings.records import (  # noqa: E402
     ArmStates,
     DepthImage,

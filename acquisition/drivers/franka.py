@@ -20,7 +20,7 @@ from jaxtyping import Float
 from numpy import ndarray as Array
 
 from acquisition.devices import DeviceRefused
-from acquisition.drivers.worker_arm import WorkerArm
+from acquisition.drivers.workers.arm import WorkerArm
 from recordings.errors import DeviceNotFound
 
 REALTIME = Path("/sys/kernel/realtime")
@@ -40,7 +40,7 @@ class FrankaArm(WorkerArm):
     joint_names = JOINT_NAMES
     rate_hz = 1000.0
     clock = "fci"
-    module = "acquisition.drivers.franka_worker"
+    module = "acquisition.drivers.workers.franka"
 
     def __init__(
         self,

@@ -15,9 +15,9 @@ from typing import Any
 
 from acquisition.devices import DeviceLost, DeviceRefused, GripperCommand, GripperSample, Health
 from acquisition.drivers.franka import check_identity, not_opened
-from acquisition.drivers.franka_hand_worker import SAMPLE
 from acquisition.drivers.inbox import Inbox
-from acquisition.drivers.worker import Worker
+from acquisition.drivers.workers.franka_hand import SAMPLE
+from acquisition.drivers.workers.process import Worker
 
 OPEN_S = 10.0
 BUFFER = 1000
@@ -61,7 +61,7 @@ class FrankaHand:
         self.close()
         self._clean()
         self._inbox = Inbox(BUFFER)
-        module = "acquisition.drivers.franka_hand_worker"
+        module = "acquisition.drivers.workers.franka_hand"
         self._worker = Worker(module, [self._host], self._on_frame, self._on_end)
         if self._opened.wait(OPEN_S) and self._failure is None:
             return

@@ -24,6 +24,7 @@ import numpy as np
 from jaxtyping import Int64
 from numpy import ndarray as Array
 
+from acquisition.arm.toss import TossPlan
 from acquisition.devices import (
     ArmMode,
     ArmSamples,
@@ -40,10 +41,9 @@ from acquisition.devices import (
 )
 from acquisition.rig import DeviceEntry, RecordingConfig, Rig
 from acquisition.setup import Setup
-from acquisition.toss import TossPlan
-from recordings.codec import decode_image
 from recordings.errors import BadInput
 from recordings.geometry import CameraModel, Transform
+from recordings.mcap.codec import decode_image
 from recordings.progress import Progress
 from recordings.records import ArmStates, DepthImage, EncodedImage
 from recordings.session import Session, Toss

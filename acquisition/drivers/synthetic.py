@@ -6,7 +6,7 @@
     with lab.device("d455", "rgbd") as camera: ...
 
 The scene is that of `acquisition.synthetic`; what is true (poses, exposure times) is written beside a session by
-`acquisition.synthetic.beside`, never into it.
+`acquisition.synthetic.truth_sidecar`, never into it.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ import numpy as np
 from jaxtyping import Float, Int64
 from numpy import ndarray as Array
 
+from acquisition.arm.toss import TossPlan
 from acquisition.devices import (
     ArmMode,
     ArmSamples,
@@ -36,9 +37,8 @@ from acquisition.devices import (
     Stamp,
 )
 from acquisition.simulators.faults import Faults
-from acquisition.synthetic.chance import generator
+from acquisition.synthetic.random_draws import generator
 from acquisition.synthetic.world import Stage
-from acquisition.toss import TossPlan
 from recordings.errors import BadInput
 from recordings.geometry import CameraModel, Transform
 from recordings.progress import Progress

@@ -13,7 +13,7 @@ from importlib import metadata
 from typing import Any
 
 from acquisition.devices import DeviceRefused
-from acquisition.drivers.worker_arm import WorkerArm
+from acquisition.drivers.workers.arm import WorkerArm
 from recordings.errors import DeviceNotFound
 
 JOINT_NAMES = (
@@ -30,7 +30,7 @@ class UrArm(WorkerArm):
     joint_names = JOINT_NAMES
     rate_hz = 500.0
     clock = "ur"
-    module = "acquisition.drivers.ur_worker"
+    module = "acquisition.drivers.workers.ur"
 
     def __init__(
         self,

@@ -14,14 +14,14 @@ from jaxtyping import Float
 from numpy import ndarray as Array
 
 from acquisition.synthetic.config import ArmConfig
-from acquisition.synthetic.grasp import Grasp
 from acquisition.synthetic.motion import Release, Trajectory
-from acquisition.synthetic.paint import Gloss, PaintedMesh
-from acquisition.synthetic.rays import Body, Placed
-from acquisition.synthetic.solids import corner_normals
-from recordings.collada import ColoredMesh, read_collada
+from acquisition.synthetic.objects.grasp import Grasp
+from acquisition.synthetic.objects.paint import Gloss, PaintedMesh
+from acquisition.synthetic.objects.solids import corner_normals
+from acquisition.synthetic.render.rays import Body, Placed
 from recordings.geometry import Transform, quaternion_from_rotation, rotation_exp, rotation_log
-from recordings.robot import PANDA_TOOL, Robot, panda
+from recordings.robot.arm import PANDA_TOOL, Robot, panda
+from recordings.robot.collada import ColoredMesh, read_collada
 
 READY_RAD = np.array([0.0, -0.3, 0.0, -2.1, 0.0, 2.1, 0.785])
 SPEED_SHARE = 0.85

@@ -8,12 +8,12 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray as Array
 
-from acquisition.synthetic import textures
-from acquisition.synthetic.objects import box
-from acquisition.synthetic.paint import Gloss, assemble
-from acquisition.synthetic.rays import Body
+from acquisition.synthetic.objects import textures
+from acquisition.synthetic.objects.paint import Gloss, assemble
+from acquisition.synthetic.objects.shapes import box
+from acquisition.synthetic.render.rays import Body
 from recordings.geometry import CameraModel, Transform, rotation_exp
-from recordings.robot import Robot, panda
+from recordings.robot.arm import Robot, panda
 from recordings.tracks import TagPlacement
 
 COLUMNS, ROWS = 5, 4

@@ -14,9 +14,9 @@ from numpy import ndarray as Array
 
 from acquisition.synthetic import physics
 from acquisition.synthetic.board import board_pose, board_tags
-from acquisition.synthetic.chance import BOARD, generator
 from acquisition.synthetic.lab import Lab
-from acquisition.synthetic.paint import PaintedMesh
+from acquisition.synthetic.objects.paint import PaintedMesh
+from acquisition.synthetic.random_draws import BOARD, generator
 from acquisition.synthetic.scene import SyntheticToss, simulate
 from recordings.errors import BadInput, WriteFailed
 from recordings.geometry import CameraModel, Transform
@@ -277,7 +277,7 @@ def _intrinsics(camera: CameraModel) -> dict[str, Any]:
 
 def _write_mesh(mesh: PaintedMesh, folder: Path) -> None:
     """Wavefront OBJ with an sRGB texture (v axis up, as OBJ wants it)."""
-    from acquisition.synthetic.sensors import color_image
+    from acquisition.synthetic.render.sensors import color_image
 
     _write_png(folder / "texture.png", color_image(mesh.atlas)[..., ::-1])
     (folder / "texture.mtl").write_text("newmtl texture\nKd 1 1 1\nmap_Kd texture.png\n")

@@ -12,11 +12,15 @@ import numpy as np
 from jaxtyping import Float32, UInt8, UInt16
 from numpy import ndarray as Array
 
-from acquisition.synthetic import objects, sensors
 from acquisition.synthetic.arm import Arm
 from acquisition.synthetic.board import board_body
-from acquisition.synthetic.cameras import MONO_NAMES, camera_model, look_at, mono_model, mono_pose
-from acquisition.synthetic.chance import (
+from acquisition.synthetic.config import MonoConfig, SceneConfig
+from acquisition.synthetic.objects import shapes as objects
+from acquisition.synthetic.objects.grasp import grasp
+from acquisition.synthetic.objects.paint import paint_object
+from acquisition.synthetic.objects.textures import WHITE
+from acquisition.synthetic.planner import Motion, Planner
+from acquisition.synthetic.random_draws import (
     COLOR,
     DEPTH,
     ERRORS,
@@ -30,14 +34,20 @@ from acquisition.synthetic.chance import (
     generator,
     small_error,
 )
-from acquisition.synthetic.config import MonoConfig, SceneConfig
-from acquisition.synthetic.grasp import grasp
-from acquisition.synthetic.optics import Light, Placement, Sight, StillPicture, View, picture, sight, still_picture
-from acquisition.synthetic.paint import paint_object
-from acquisition.synthetic.planner import Motion, Planner
-from acquisition.synthetic.rays import Body, Placed, Standing
-from acquisition.synthetic.room import build_room
-from acquisition.synthetic.textures import WHITE
+from acquisition.synthetic.render import sensors
+from acquisition.synthetic.render.cameras import MONO_NAMES, camera_model, look_at, mono_model, mono_pose
+from acquisition.synthetic.render.optics import (
+    Light,
+    Placement,
+    Sight,
+    StillPicture,
+    View,
+    picture,
+    sight,
+    still_picture,
+)
+from acquisition.synthetic.render.rays import Body, Placed, Standing
+from acquisition.synthetic.render.room import build_room
 from recordings.errors import BadInput
 from recordings.geometry import Transform, rotation_exp
 

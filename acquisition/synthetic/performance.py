@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray as Array
 
-from acquisition.synthetic.chance import TIMES, generator
 from acquisition.synthetic.lab import Lab
 from acquisition.synthetic.planner import Motion
+from acquisition.synthetic.random_draws import TIMES, generator
 from recordings.progress import Progress, Silent
 
 See = Callable[[float, int], Array]

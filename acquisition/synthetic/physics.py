@@ -10,8 +10,8 @@ from numpy import ndarray as Array
 
 from acquisition.synthetic.config import ContactConfig
 from acquisition.synthetic.motion import Release, Trajectory
-from acquisition.synthetic.objects import MassProperties
-from acquisition.synthetic.solids import Solid
+from acquisition.synthetic.objects.shapes import MassProperties
+from acquisition.synthetic.objects.solids import Solid
 
 STILL_M_S, STILL_RAD_S = 0.01, 0.15
 STILL_FOR_S = 0.1

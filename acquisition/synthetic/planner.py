@@ -8,15 +8,15 @@ from functools import cached_property
 import numpy as np
 
 from acquisition.synthetic.arm import FORWARD_S, Arm, Swing
-from acquisition.synthetic.chance import TOSS, draw_release, generator
 from acquisition.synthetic.config import SceneConfig
 from acquisition.synthetic.motion import Instants, Release, Trajectory, unseen_hand
-from acquisition.synthetic.objects import MassProperties
-from acquisition.synthetic.optics import View
+from acquisition.synthetic.objects.shapes import MassProperties
+from acquisition.synthetic.objects.solids import Solid
 from acquisition.synthetic.physics import Table
-from acquisition.synthetic.rays import Body
-from acquisition.synthetic.room import TABLE_HALF_M
-from acquisition.synthetic.solids import Solid
+from acquisition.synthetic.random_draws import TOSS, draw_release, generator
+from acquisition.synthetic.render.optics import View
+from acquisition.synthetic.render.rays import Body
+from acquisition.synthetic.render.room import TABLE_HALF_M
 from recordings.errors import BadInput
 
 TRIES = 300

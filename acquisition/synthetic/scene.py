@@ -13,10 +13,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8, UInt16
 from numpy import ndarray as Array
 
-from acquisition.synthetic.chance import ARM_NOISE, brightness_course, frame_times, generator
 from acquisition.synthetic.config import SceneConfig
 from acquisition.synthetic.lab import Lab
 from acquisition.synthetic.planner import Motion
+from acquisition.synthetic.random_draws import ARM_NOISE, brightness_course, frame_times, generator
 from recordings.geometry import Transform
 from recordings.progress import Progress, Silent
 

@@ -15,11 +15,10 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray as Array
 
+from acquisition.arm.toss import TossPlan
 from acquisition.devices import JointTrajectory
 from acquisition.synthetic.arm import FORWARD_S, OPEN_M, READY_RAD, Swing
 from acquisition.synthetic.board import board_before, held_board_poses
-from acquisition.synthetic.cameras import MONO_NAMES
-from acquisition.synthetic.chance import BOARD, generator
 from acquisition.synthetic.config import (
     ArmConfig,
     CameraConfig,
@@ -33,7 +32,8 @@ from acquisition.synthetic.config import (
 from acquisition.synthetic.motion import Instants, Trajectory
 from acquisition.synthetic.performance import Performance, Reel, perform
 from acquisition.synthetic.planner import Motion
-from acquisition.toss import TossPlan
+from acquisition.synthetic.random_draws import BOARD, generator
+from acquisition.synthetic.render.cameras import MONO_NAMES
 from recordings.geometry import CameraModel, Transform
 from recordings.progress import Progress
 from recordings.tracks import RigCalibration

@@ -15,8 +15,8 @@ from recordings.progress import Progress, Silent
 from recordings.tracks import ObjectTrack
 
 if TYPE_CHECKING:
-    from processing.contact.motion import PoseSeries
-    from processing.truth import Truth
+    from processing.evaluate.truth import Truth
+    from processing.motion.trajectory import PoseSeries
     from recordings.session import Session
     from recordings.tracks import ObjectShape
 
@@ -134,7 +134,7 @@ def find_poses(
 ) -> PoseSource:
     """The poses of some tosses: those of vision where the results folder holds them, else `/track/pose`, or the
     truth."""
-    from processing.contact.motion import PoseSeries
+    from processing.motion.trajectory import PoseSeries
 
     vision = _vision(out_dir)
     if poses == "truth":
@@ -165,7 +165,7 @@ class PoseSource:
 
 def _truth_poses(session: Session, tosses: Sequence[int], given: Path | None, vision: PoseSource | None) -> PoseSource:
     """True poses, in the truth's own object frame; vision's shape is brought into it where there is one."""
-    from processing.truth import open_truth
+    from processing.evaluate.truth import open_truth
 
     truth = open_truth(given, session, session.calibration)
     if truth is None:
@@ -182,7 +182,7 @@ def _truth_poses(session: Session, tosses: Sequence[int], given: Path | None, vi
 
 
 def _true_series(truth: Truth, session: Session, toss: int) -> PoseSeries | None:
-    from processing.contact.motion import PoseSeries
+    from processing.motion.trajectory import PoseSeries
     from recordings.session import Toss
     from recordings.session_writer import toss_name
 
@@ -220,8 +220,8 @@ def in_frame_of(tracks: Sequence[PoseSeries], vision: PoseSource) -> ObjectShape
 
 def _vision(out_dir: Path) -> PoseSource | None:
     """Tracks and shape of the best variant in a results folder whose tosses share an object frame."""
-    from processing.contact.motion import PoseSeries
-    from recordings.results import Results
+    from processing.motion.trajectory import PoseSeries
+    from recordings.results.folder import Results
 
     if not Results.is_results(out_dir):
         return None

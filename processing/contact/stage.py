@@ -13,27 +13,27 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from processing.contact.choice import CLASSES, ClassName
 from processing.contact.command import DEFAULT_STEPS, STAGE, VERSION, PoseSource
-from processing.contact.data_checks import check_frames, duplicate_groups, refuse_leaks
-from processing.contact.evaluate import Evaluation, evaluate, world_poses
-from processing.contact.export import write_assets
-from processing.contact.figure import draw_result
-from processing.contact.fit import FitConfig
-from processing.contact.from_tracks import TracksConfig, learn_from_series
-from processing.contact.inertia import Physics, physics_of_session, uniform_box_physics, uniform_physics
-from processing.contact.learn import ContactConfig, ContactLearning, learn_contact
-from processing.contact.motion import PoseSeries
-from processing.contact.plane import Plane, calibrated_plane
-from processing.contact.prepared import no_contact, none_usable
-from processing.contact.prior import Prior, prior_from_shape, prior_from_size
-from processing.contact.result import result_document, result_text, warnings_of
-from processing.contact.segment import find_phases
-from processing.contact.support import CAP_M2
-from processing.stage import Store
+from processing.contact.learn.convexity import CLASSES, ClassName
+from processing.contact.learn.data_checks import check_frames, duplicate_groups, refuse_leaks
+from processing.contact.learn.fit import FitConfig
+from processing.contact.learn.from_tracks import TracksConfig, learn_from_series
+from processing.contact.learn.learn import ContactConfig, ContactLearning, learn_contact
+from processing.contact.learn.prepared import no_contact, none_usable
+from processing.contact.learn.prior import Prior, prior_from_shape, prior_from_size
+from processing.contact.physics.inertia import Physics, physics_of_session, uniform_box_physics, uniform_physics
+from processing.contact.physics.plane import Plane, calibrated_plane
+from processing.contact.physics.support import CAP_M2
+from processing.contact.report.assets import write_assets
+from processing.contact.report.figure import draw_result
+from processing.contact.report.result import result_document, result_text, warnings_of
+from processing.contact.report.rollout_errors import Evaluation, evaluate, world_poses
+from processing.motion.phases import find_phases
+from processing.motion.trajectory import PoseSeries
+from processing.store import Store
 from recordings.errors import BadInput
 from recordings.progress import Progress
-from recordings.results import VariantRecord, write_contact, write_shape, write_variant
+from recordings.results.folder import VariantRecord, write_contact, write_shape, write_variant
 from recordings.session_writer import toss_name, write_json
 from recordings.tracks import ObjectShape
 

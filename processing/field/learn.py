@@ -17,7 +17,7 @@ from recordings.errors import BadInput
 from recordings.geometry import CameraModel
 from recordings.progress import Progress
 from recordings.records import RgbdFrame
-from recordings.results import RobotMasks
+from recordings.results.folder import RobotMasks
 from recordings.tracks import ObjectShape, ObjectTrack
 
 

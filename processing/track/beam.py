@@ -13,11 +13,19 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray as Array
 
+from processing.features.sift import FeatureMatcher, Features, RansacConfig, relative_motions
+from processing.motion.motion_prior import (
+    MotionConfig,
+    carried_on,
+    change_cost,
+    moved,
+    steady_spin,
+    turn_between,
+    turn_grid,
+)
+from processing.sensor.view import ViewStore
 from processing.track import kernels as k
-from processing.track.features import FeatureMatcher, Features, RansacConfig, relative_motions
 from processing.track.keyframes import KeyframeConfig, is_new, references
-from processing.track.motion import MotionConfig, carried_on, change_cost, moved, steady_spin, turn_between, turn_grid
-from processing.track.views import ViewStore
 
 Schedule = tuple[tuple[int, int, float, float, float, float], ...]
 """Rows of kernels.align_view: level (0 sharp, 1 smooth), steps, depth scale (m at 0.8 m), scale of the looks, outline

@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray as Array
 
+from processing.motion.motion_prior import between
 from processing.track.beam import Scene
-from processing.track.motion import between
 from recordings.geometry import rotation_log, skew
 from recordings.tracks import Status
 

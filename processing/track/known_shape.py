@@ -13,13 +13,13 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray as Array
 
+from processing.features.sift import relative_motions
+from processing.motion.motion_prior import all_turns
+from processing.sensor.rectification import Optics
+from processing.sensor.view import Crop
 from processing.track import kernels as k
 from processing.track.beam import BeamConfig, Candidate, Scene, Schedule, merged, rows
-from processing.track.features import relative_motions
 from processing.track.keyframes import references
-from processing.track.motion import all_turns
-from processing.track.optics import Optics
-from processing.track.views import Crop
 from recordings.errors import BadInput
 from recordings.tracks import ObjectShape
 

@@ -8,10 +8,10 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray as Array
 
+from processing.features.sift import FeatureMatcher, Features
 from processing.track import kernels as k
-from processing.track.features import FeatureMatcher, Features
-from processing.track.sequence import TossTrack
-from recordings.track_notes import Matches, Rejected
+from processing.track.track_toss import TossTrack
+from recordings.results.track_notes import Matches, Rejected
 
 
 @dataclass(frozen=True)

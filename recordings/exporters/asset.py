@@ -12,7 +12,7 @@ from pathlib import Path
 from recordings.errors import BadInput
 from recordings.exporters.common import ExportReport, count_files, new_files, open_results
 from recordings.progress import Progress
-from recordings.results import Results, VariantRecord
+from recordings.results.folder import Results, VariantRecord
 from recordings.session_writer import toss_name
 
 ASSETS = "assets"

@@ -9,13 +9,13 @@ import numpy as np
 from jaxtyping import Bool, Float32, UInt16
 from numpy import ndarray as Array
 
-from recordings.codec import encode_mask
 from recordings.errors import BadInput
 from recordings.exporters.common import ExportReport, count_files, new_files, open_recording
 from recordings.exporters.images import depth_png, image_file
 from recordings.geometry import CameraModel
+from recordings.mcap.codec import encode_mask
 from recordings.progress import Progress, Silent
-from recordings.results import Results
+from recordings.results.folder import Results
 from recordings.session import Session, Toss
 from recordings.session_writer import toss_name
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from recordings.errors import BadInput, WriteFailed
-from recordings.results import Results
+from recordings.results.folder import Results
 from recordings.session import Session
 
 

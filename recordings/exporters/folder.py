@@ -14,11 +14,11 @@ import numpy as np
 from jaxtyping import Int64
 from numpy import ndarray as Array
 
-from recordings.codec import encode_mask
 from recordings.errors import BadInput
 from recordings.exporters.common import ExportReport, count_files, new_files, open_recording
 from recordings.exporters.images import depth_png, image_file
 from recordings.geometry import CameraModel
+from recordings.mcap.codec import encode_mask
 from recordings.progress import Progress, Silent
 from recordings.records import ArmStates, EncodedImage
 from recordings.session import Frames, Session, Toss

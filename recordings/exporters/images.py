@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import UInt16
 from numpy import ndarray as Array
 
-from recordings.codec import decode_image
 from recordings.errors import BadInput
+from recordings.mcap.codec import decode_image
 from recordings.records import EncodedImage
 
 SUFFIXES = {"jpeg": ".jpg", "png": ".png"}

@@ -21,15 +21,15 @@ from jaxtyping import Float, Int64
 from numpy import ndarray as Array
 
 from recordings import sync
-from recordings.codec import decode_image
 from recordings.errors import BadInput
 from recordings.exporters.common import ExportReport, count_files, new_files, open_recording
 from recordings.exporters.images import depth_png
 from recordings.exporters.lerobot_files import Column, Statistics, Video, write_data, write_episodes, write_tasks
 from recordings.geometry import quaternion_from_rotation
+from recordings.mcap.codec import decode_image
 from recordings.progress import Progress, Silent
 from recordings.records import ArmStates
-from recordings.results import Results
+from recordings.results.folder import Results
 from recordings.session import Session, Toss
 from recordings.tracks import ObjectTrack
 

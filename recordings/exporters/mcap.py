@@ -12,10 +12,10 @@ from pathlib import Path
 
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 
-from recordings import codec
 from recordings.exporters.common import ExportReport, new_files, open_recording
-from recordings.mcap_file import McapFile, Message
-from recordings.mcap_writer import McapWriter
+from recordings.mcap import codec
+from recordings.mcap.file import McapFile, Message
+from recordings.mcap.writer import McapWriter
 from recordings.progress import Progress, Silent
 
 DEPTH_SCHEMA = "tosslab.DepthImage"

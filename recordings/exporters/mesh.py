@@ -6,9 +6,9 @@ from pathlib import Path
 
 from recordings.exporters.common import ExportReport, new_files, open_results
 from recordings.progress import Progress
-from recordings.results import Results, VariantRecord
+from recordings.results.folder import Results, VariantRecord
+from recordings.results.shape_file import obj_text
 from recordings.session_writer import toss_name
-from recordings.shape_file import obj_text
 from recordings.tracks import ObjectShape
 
 

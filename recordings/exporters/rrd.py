@@ -12,7 +12,7 @@ def export_rrd(
     source: Path, out: Path, variant: str | None = None, scope: str | None = None, progress: Progress | None = None
 ) -> ExportReport:
     """Write OUT (a file). `source` is a session, one toss's file or a results folder."""
-    from recordings.view import Choice, save_rrd  # brings rerun
+    from recordings.view.draw import Choice, save_rrd  # brings rerun
 
     save_rrd(source, new_file(out), Choice(variant=variant, scope=scope), progress=progress or Silent())
     return ExportReport("rrd", out, 1)

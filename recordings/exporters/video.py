@@ -8,10 +8,10 @@ import numpy as np
 
 from recordings.errors import BadInput
 from recordings.exporters.common import ExportReport, new_files, open_recording, open_results
-from recordings.film import Film
-from recordings.film_file import movie_codec, write_gif, write_mp4
+from recordings.film.file import movie_codec, write_gif, write_mp4
+from recordings.film.film import Film
 from recordings.progress import Progress, Silent
-from recordings.results import Results, VariantRecord
+from recordings.results.folder import Results, VariantRecord
 from recordings.session import Session
 from recordings.session_writer import toss_name
 from recordings.tracks import ObjectTrack

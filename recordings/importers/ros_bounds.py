@@ -19,7 +19,7 @@ from rosbags.rosbag2 import storage_mcap, storage_sqlite3
 
 from recordings.errors import BadInput
 from recordings.limits import MOST_CHUNK_BYTES, Budget, unpack, unpack_some
-from recordings.mcap_scan import Bytes, chunk_records, parse_chunk, record_at
+from recordings.mcap.scan import Bytes, chunk_records, parse_chunk, record_at
 from recordings.yaml_file import parse_yaml
 
 SUSPICIOUS_TIMES = 50

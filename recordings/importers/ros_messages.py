@@ -11,11 +11,11 @@ import numpy as np
 from jaxtyping import Int64, UInt16
 from numpy import ndarray as Array
 
-from recordings.codec import decode_pixels
 from recordings.errors import BadInput
 from recordings.importers.common import Warnings
 from recordings.importers.images import PNG_MAGIC, read_header
 from recordings.importers.ros_bag_file import Bag
+from recordings.mcap.codec import decode_pixels
 from recordings.records import ArmStates, ImageEncoding
 
 CHANNELS = {"rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4, "mono8": 1, "8UC1": 1, "8UC3": 3}

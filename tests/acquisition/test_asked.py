@@ -16,17 +16,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from acquisition.arm_thrower import ArmThrower
-from acquisition.asked import ask, count_down, watch_motion
+from acquisition.arm.asked import ask, count_down, watch_motion
+from acquisition.arm.limits import arm_model
+from acquisition.arm.throw import ByHand
+from acquisition.arm.thrower import ArmThrower
+from acquisition.arm.workspace import Space
 from acquisition.command import at_speed, the_operator
 from acquisition.devices import GripperCommand, GripperSample, JointTrajectory, Motion
 from acquisition.operator import Keyboard, Nobody, Unattended
-from acquisition.recorder import Recorder
 from acquisition.rig import Rig, TossConfig, Workspace, find_rig, read_rig
 from acquisition.setup import NO_CALIBRATION, Setup, set_up
-from acquisition.throw import ByHand
-from acquisition.toss_limits import arm_model
-from acquisition.workspace import Space
+from acquisition.streaming.recorder import Recorder
 from recordings.errors import BadInput, TosslabError
 from recordings.geometry import Transform
 from recordings.progress import Silent
@@ -326,8 +326,8 @@ def test_an_arm_that_hangs_is_halted() -> None:
     arm = PlainArm(person, PANDA.ready_rad, fast=0.0)
     arm.move(JointTrajectory(np.array([0.0, 1.0]), np.stack([PANDA.ready_rad] * 2), np.zeros((2, 7))))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("acquisition.asked.LATE_S", 0.1)
-        patch.setattr("acquisition.asked.LATE_SHARE", 0.1)
+        patch.setattr("acquisition.arm.asked.LATE_S", 0.1)
+        patch.setattr("acquisition.arm.asked.LATE_SHARE", 0.1)
         with pytest.raises(TosslabError, match="it was halted"):
             watch_motion(arm, person, 1.0, "the way")
     assert "HALT" in person.log

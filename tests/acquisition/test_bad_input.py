@@ -15,7 +15,7 @@ import pytest
 from acquisition.cli import main
 from acquisition.doctor import doctor
 from acquisition.drivers import usb
-from recordings.verify import verify
+from recordings.verify.verify import verify
 
 ROOT = Path(__file__).resolve().parents[2]
 POOL = """name = "pool"

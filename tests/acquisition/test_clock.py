@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from acquisition.clock import ClockMapper, SessionClock, fit_line
+from acquisition.streaming.clock import ClockMapper, SessionClock, fit_line
 
 EPOCH_NS = 10**12
 DEVICE_START_NS = 5 * 10**9

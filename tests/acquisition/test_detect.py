@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from acquisition.arm.limits import arm_model
 from acquisition.detect import Eye, Glimpse, TossWatcher, release_from_widths, still_since_s
-from acquisition.toss_limits import arm_model
 from recordings.geometry import CameraModel, Transform, rotation_exp
 
 RELEASE_S, HALF_M, FPS = 1.0, 0.035, 30.0

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from acquisition.devices import DeviceLost, Image, JointTrajectory, Stamp
 from acquisition.drivers.inbox import Inbox
-from acquisition.drivers.path import BRAKE_S, Brake, along, from_here
+from acquisition.drivers.workers.path import BRAKE_S, Brake, along, from_here
 
 
 def cubic(count: int, seconds: float) -> JointTrajectory:

@@ -14,9 +14,9 @@ import pytest
 from acquisition.drivers.synthetic import SyntheticConfig, SyntheticLab
 from acquisition.run import check_disk
 from recordings.errors import TosslabError
-from recordings.mcap_sink import Sink
+from recordings.mcap.sink import Sink
 from recordings.session import Session
-from recordings.verify import verify
+from recordings.verify.verify import verify
 
 SMALL = SyntheticConfig(
     pictures="pool",

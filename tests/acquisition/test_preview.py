@@ -7,14 +7,14 @@ from pathlib import Path
 
 import pytest
 
-from acquisition.clock import SessionClock
 from acquisition.drivers.synthetic import SyntheticConfig, SyntheticLab, SyntheticThrower
 from acquisition.preview import Preview
-from acquisition.recorder import Recorder
 from acquisition.rig import DeviceEntry, Rig
+from acquisition.streaming.clock import SessionClock
+from acquisition.streaming.recorder import Recorder
 from recordings.progress import Silent
-from recordings.view_live import LiveView
-from recordings.view_viewer import ViewerFailed
+from recordings.view.live import LiveView
+from recordings.view.viewer import ViewerFailed
 
 
 @pytest.mark.slow

@@ -16,14 +16,14 @@ import pytest
 
 from acquisition.cli import main
 from acquisition.detect import Moment, TossEvents
-from acquisition.gate import Trouble
-from acquisition.lane import Item, Lane, Take
 from acquisition.rig import RecordingConfig
-from acquisition.streams import BoundedQueue, Counter, Tally
+from acquisition.streaming.sequence_check import Trouble
+from acquisition.streaming.stream_queue import Item, Lane, Take
+from acquisition.streaming.streams import BoundedQueue, Counter, Tally
 from acquisition.verdict import judge
 from recordings.session import Session
 from recordings.session_writer import SessionWriter, TossWriter
-from recordings.verify import verify
+from recordings.verify.verify import verify
 
 ROOT = Path(__file__).resolve().parents[2]
 RIG = """name = "pool"

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from acquisition.cli import main as toss_record
-from acquisition.synthetic.beside import stamp_errors_ms
+from acquisition.synthetic.truth_sidecar import stamp_errors_ms
 from calibration.cli import main as toss_calibrate
 
 RIG = """name = "times"

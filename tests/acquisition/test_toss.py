@@ -8,23 +8,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from acquisition.approach import plan_approach
-from acquisition.arm_thrower import ArmThrower, base_in_world, estimate_delay, onset_s
-from acquisition.dynamics import torques
-from acquisition.kinematics import Batch, segment_distance
+from acquisition.arm.approach import plan_approach
+from acquisition.arm.dynamics import torques
+from acquisition.arm.kinematics import Batch, segment_distance
+from acquisition.arm.limits import SHARE, ArmModel, Held, arm_model
+from acquisition.arm.thrower import ArmThrower, base_in_world, estimate_delay, onset_s
+from acquisition.arm.toss import ReleaseDelay, Samples, TossRefused, check_limits, draw_target, plan_toss, slowed
+from acquisition.arm.workspace import Space
 from acquisition.operator import Nobody
 from acquisition.rig import TossConfig
-from acquisition.toss import (
-    ReleaseDelay,
-    Samples,
-    TossRefused,
-    check_limits,
-    draw_target,
-    plan_toss,
-    slowed,
-)
-from acquisition.toss_limits import SHARE, ArmModel, Held, arm_model
-from acquisition.workspace import Space
 from recordings.errors import BadInput
 from recordings.geometry import Transform, rotation_exp, rotation_log
 from recordings.tracks import RigCalibration

@@ -10,8 +10,8 @@ import pytest
 from acquisition.cli import main
 from acquisition.setup import set_up
 from acquisition.views import PER_CAMERA, Coverage, progress_text, tilt_of
+from calibration.cameras.targets import TargetView
 from calibration.cli import main as calibrate
-from calibration.targets import TargetView
 from recordings.geometry import Transform
 from recordings.session import Session, Toss
 from recordings.tracks import RigCalibration

@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from acquisition.approach import FASTEST_M_S, fastest_m_s, find_way, plan_approach
-from acquisition.arm_thrower import safe_to_move
-from acquisition.kinematics import Batch
+from acquisition.arm.approach import FASTEST_M_S, fastest_m_s, find_way, plan_approach
+from acquisition.arm.kinematics import Batch
+from acquisition.arm.limits import arm_model
+from acquisition.arm.thrower import safe_to_move
+from acquisition.arm.toss import ReleaseDelay, Samples, TossRefused, check_limits, draw_target, plan_toss
+from acquisition.arm.workspace import STEP_M, TABLE_CLEARANCE_M, PathRefused, Space, dense, reaches_m
 from acquisition.rig import Post, Rig, TossConfig, Workspace, find_rig, read_rig
-from acquisition.toss import ReleaseDelay, Samples, TossRefused, check_limits, draw_target, plan_toss
-from acquisition.toss_limits import arm_model
-from acquisition.workspace import STEP_M, TABLE_CLEARANCE_M, PathRefused, Space, dense, reaches_m
 from recordings.errors import BadInput
 from recordings.geometry import Transform
 from recordings.tracks import RigCalibration

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from calibration.targets import Tags, TargetView
+from calibration.cameras.targets import Tags, TargetView
 from recordings.geometry import CameraModel
 
 CAMERAS = ("d455", "mono0", "mono1", "mono2")

@@ -8,14 +8,14 @@ import cv2
 import numpy as np
 import pytest
 
+from calibration.cameras.extrinsics import calibrate_cameras
+from calibration.cameras.intrinsics import calibrate_intrinsics, new_matrix_alpha
+from calibration.cameras.poses import angle_deg, inverse_poses
+from calibration.cameras.targets import NOTHING, Charuco, Chessboard, Tags, find_target, tag_view, target_from_document
 from calibration.drift import bumps, drift_findings
-from calibration.extrinsics import calibrate_cameras
-from calibration.intrinsics import calibrate_intrinsics, new_matrix_alpha
-from calibration.poses import angle_deg, inverse_poses
-from calibration.tag_faults import sizes_by_triangulation, wrong_sizes
-from calibration.tagged_object import solve_tagged_object
-from calibration.tags import TagDetection
-from calibration.targets import NOTHING, Charuco, Chessboard, Tags, find_target, tag_view, target_from_document
+from calibration.tags.detect import TagDetection
+from calibration.tags.faults import sizes_by_triangulation, wrong_sizes
+from calibration.tags.tagged_object import solve_tagged_object
 from recordings.errors import BadInput
 from recordings.geometry import Transform
 from recordings.tracks import RigCalibration, TagPlacement

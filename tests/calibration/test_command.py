@@ -7,10 +7,10 @@ import json
 import numpy as np
 import pytest
 
+from calibration.cameras.poses import angle_deg, inverse_poses
 from calibration.cli import main
-from calibration.poses import angle_deg, inverse_poses
 from recordings.tracks import RigCalibration
-from recordings.verify import verify
+from recordings.verify.verify import verify
 
 TAG_M = "0.06140625"
 

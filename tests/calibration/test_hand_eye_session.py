@@ -15,7 +15,7 @@ from acquisition.synthetic.lab import Lab
 from calibration.cli import main
 from recordings.geometry import Transform, rotation_exp
 from recordings.records import ArmStates, EncodedImage
-from recordings.robot import panda
+from recordings.robot.arm import panda
 from recordings.session_writer import SessionWriter
 from recordings.tracks import RigCalibration
 

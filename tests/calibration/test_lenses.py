@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from calibration.intrinsics import calibrate_intrinsics
-from calibration.lens_fit import solve_lens
-from calibration.lens_support import unsupported
-from calibration.targets import Chessboard, find_target
+from calibration.cameras.intrinsics import calibrate_intrinsics
+from calibration.cameras.lens_fit import solve_lens
+from calibration.cameras.lens_support import unsupported
+from calibration.cameras.targets import Chessboard, find_target
 from recordings.geometry import CameraModel
 
 BOARD = Chessboard(9, 6, 0.03)

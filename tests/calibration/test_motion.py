@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from calibration.cameras.poses import angle_deg, exp_poses, inverse_poses, log_poses
+from calibration.cameras.targets import Tags
 from calibration.ground_plane import (
     Plane,
     find_flight,
@@ -16,8 +18,6 @@ from calibration.ground_plane import (
     table_points,
 )
 from calibration.hand_eye import best_start, calibrate_hand_eye, daniilidis, missing_motion, park
-from calibration.poses import angle_deg, exp_poses, inverse_poses, log_poses
-from calibration.targets import Tags
 from calibration.time_offset import (
     Path3,
     TimeOffset,

@@ -8,9 +8,9 @@ from pathlib import Path
 import cv2
 import pytest
 
-from calibration.intrinsics import calibrate_intrinsics
-from calibration.lens_support import unsupported
-from calibration.targets import Chessboard, find_target
+from calibration.cameras.intrinsics import calibrate_intrinsics
+from calibration.cameras.lens_support import unsupported
+from calibration.cameras.targets import Chessboard, find_target
 
 SETS = Path(os.environ.get("TOSSLAB_CALIBRATION_SETS", Path.home() / ".cache" / "tosslab-calibration"))
 PUBLISHED_PX = 518.05

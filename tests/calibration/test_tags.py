@@ -11,10 +11,10 @@ import cv2
 import numpy as np
 import pytest
 
-from calibration import tags as tags_module
-from calibration.dots import corner_noise_px, dots_advice
-from calibration.tag_faults import explain_absence
-from calibration.tags import DetectorChild, DetectorDied, detect_tags
+from calibration.tags import detect as tags_module
+from calibration.tags.detect import DetectorChild, DetectorDied, detect_tags
+from calibration.tags.faults import explain_absence
+from calibration.tags.infrared_dots import corner_noise_px, dots_advice
 from recordings.errors import BadInput
 
 FAMILY = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
@@ -177,7 +177,7 @@ def test_what_is_no_grey_picture_or_no_family_is_refused():
 
 
 def test_faint_infrared_dots_do_no_harm_and_strong_ones_are_named():
-    from acquisition.synthetic.dots import with_infrared_dots
+    from acquisition.synthetic.render.dots import with_infrared_dots
 
     image, rng = (0.6 * drawn(7, 60.0, 2)[0]).astype(np.uint8), np.random.default_rng(0)
     without = detect_tags([image] * 2, jobs=1)

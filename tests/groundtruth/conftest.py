@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from calibration.tags import TagDetection
+from calibration.tags.detect import TagDetection
 from groundtruth.session_sightings import Sightings, TagSeen
 from recordings.geometry import CameraModel, Transform
 from recordings.tracks import RigCalibration, TagPlacement

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from calibration.tags import TagDetection
+from calibration.tags.detect import TagDetection
 from groundtruth.cli import main
 from groundtruth.graph import Undetermined
 from groundtruth.interpolate import GRAVITY_M_S2, classify, interpolate

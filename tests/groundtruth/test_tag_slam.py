@@ -12,12 +12,12 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from groundtruth import se3
-from groundtruth.detections import Recording, Sighting, read_recording
 from groundtruth.factors import CORNERS, Between, Coordinate, Distance, Prior, Projection
 from groundtruth.graph import Graph, SolverConfig, Undetermined, covariances, solve
-from groundtruth.problem import planar_poses
-from groundtruth.tag_slam import run_tag_slam
-from groundtruth.tagslam_config import BodyEntry, CameraEntry, NoisyPose, TagEntry, TagSlamConfig, read_config
+from groundtruth.tagslam.config import BodyEntry, CameraEntry, NoisyPose, TagEntry, TagSlamConfig, read_config
+from groundtruth.tagslam.detections import Recording, Sighting, read_recording
+from groundtruth.tagslam.problem import planar_poses
+from groundtruth.tagslam.solve import run_tag_slam
 from recordings.errors import BadInput
 from recordings.geometry import CameraModel
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from groundtruth.cli import main
-from groundtruth.detections import read_recording
-from groundtruth.tagslam_config import read_config
+from groundtruth.tagslam.config import read_config
+from groundtruth.tagslam.detections import read_recording
 from recordings.errors import BadInput
 
 ZERO = {"x": 0, "y": 0, "z": 0}

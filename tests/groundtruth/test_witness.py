@@ -10,10 +10,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from calibration.cli import main as calibrate_main
-from calibration.tags import TagDetection
+from calibration.tags.detect import TagDetection
 from groundtruth.cli import main
+from groundtruth.d455_tags import WitnessConfig, by_sightings, color_tags
 from groundtruth.toss_truth import TossTruth, TrackedLimits, statuses
-from groundtruth.witness import WitnessConfig, by_sightings, color_tags
 from recordings.cli_session import main as session_main
 from recordings.geometry import CameraModel
 from recordings.session import Toss

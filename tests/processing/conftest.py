@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from processing.segment.static_scene import SceneSettings, StaticScene, calibrated_table_depth, learn_scene
+from processing.segment.background.static_scene import SceneSettings, StaticScene, calibrated_table_depth, learn_scene
 from recordings.geometry import CameraModel, Transform, rotation_exp
 from recordings.records import ArmStates, DepthImage, EncodedImage, RgbdFrame, StampedPose
 from recordings.session_writer import SessionWriter, write_truth

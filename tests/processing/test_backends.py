@@ -24,11 +24,11 @@ from processing.backends import (
     make_segmenter,
     settings_of,
 )
-from processing.segment.background import BackgroundSegmenter, BackgroundSettings
+from processing.features.sift import FeatureMatcher
+from processing.segment.background.segmenter import BackgroundSegmenter, BackgroundSettings
+from processing.segment.background.static_scene import StaticScene
 from processing.segment.segmenter import Segmenter
-from processing.segment.static_scene import StaticScene
-from processing.segment.xmem_weights import published_layers
-from processing.track.features import FeatureMatcher
+from processing.segment.xmem.checkpoint import published_layers
 from recordings.errors import BadInput
 
 FILES = {"xmem": "XMem-s012.pth", "loftr": "loftr_outdoor.ckpt", "xfeat": "xfeat.pt", "lightglue": "sift_lightglue.pth"}
@@ -45,7 +45,7 @@ def background(tiny_world: Any) -> Segmenter:
 def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with files of the published names and layers, all zero."""
     kornia = pytest.importorskip("kornia.feature", reason="kornia is not installed: pip install -e .[learned]")
-    from processing.track.matchers_lightglue import empty_network
+    from processing.features.lightglue import empty_network
 
     folder = tmp_path_factory.mktemp("weights")
     networks = {"loftr": kornia.LoFTR(None), "xfeat": kornia.XFeat().net, "lightglue": empty_network(kornia)}

@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from processing import vision
 from processing.cli import chosen_tosses, config_of, main
 from processing.field.learn import LearnConfig
 from processing.field.train import FieldConfig
+from processing.stages import vision
 from recordings.errors import BadInput
-from recordings.results import Results
+from recordings.results.folder import Results
 
 Record = Callable[..., Path]
 
@@ -123,7 +123,7 @@ def test_tracks_and_shapes_are_the_same_bytes_with_and_without_truth(
 def test_the_truth_is_opened_after_every_track_is_written(
     tiny_world: Any, record_tiny: Record, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: Any
 ) -> None:
-    from processing import truth
+    from processing.evaluate import truth
 
     session, out = record_tiny(tosses=(0,)), tmp_path / "out"
     opened = []

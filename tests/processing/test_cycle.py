@@ -13,20 +13,20 @@ import trimesh
 
 from processing.cli import config_of, main
 from processing.config import Config
-from processing.cycle import Pass, placement
+from processing.evaluate.table import said
 from processing.field.learn import LearnConfig
 from processing.field.train import FieldConfig
-from processing.icp import IcpConfig, ShapeSurface, align_frame
-from processing.judge import JudgeConfig, ShapeDrawer, explain
 from processing.pipeline import start_run
-from processing.reproject import RaycastRenderer
-from processing.reprojected import RedrawConfig, SecondFrames, redraw
-from processing.table import said
+from processing.refine.icp import IcpConfig, ShapeSurface, align_frame
+from processing.refine.image_residuals import JudgeConfig, ShapeDrawer, explain
+from processing.refine.redrawn_frames import RedrawConfig, SecondFrames, redraw
+from processing.sensor.render import RaycastRenderer
+from processing.stages.cycle import Pass, placement
 from processing.variants import TRACKERS, find_variant
 from recordings.geometry import rotation_exp
 from recordings.notices import Notice
 from recordings.progress import Silent
-from recordings.results import Results
+from recordings.results.folder import Results
 from recordings.session import Session
 from recordings.tracks import ObjectShape, ObjectTrack, RigCalibration
 
@@ -228,7 +228,7 @@ def test_contact_without_the_cycle_leaves_the_poses_as_vision_had_them(
 def test_passes_go_on_while_the_raw_images_are_explained_better_and_the_best_is_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from processing import cycle
+    from processing.stages import cycle
 
     judged = iter([0.001, -0.02, -0.01, 0.0005])
     monkeypatch.setattr(cycle, "_told", lambda *a, **k: {"of": "x", "worse_share": next(judged), "same": False})

@@ -17,18 +17,18 @@ import numpy as np
 import pytest
 import trimesh
 
-from processing import cycle
 from processing.cli import config_of, main
 from processing.config import Config
-from processing.cycle import Pass, pose_change
-from processing.dynamics import contact_stage
 from processing.field.learn import LearnConfig
 from processing.field.train import FieldConfig
-from processing.judge import SLACK_M, Explained, JudgeConfig, difference, explain
 from processing.pipeline import start_run
-from processing.stage import Done
+from processing.refine.image_residuals import SLACK_M, Explained, JudgeConfig, difference, explain
+from processing.stages import cycle
+from processing.stages.contact import contact_stage
+from processing.stages.cycle import Pass, pose_change
+from processing.store import Done
 from recordings.progress import Silent
-from recordings.results import Results, read_shape, write_shape, write_track
+from recordings.results.folder import Results, read_shape, write_shape, write_track
 from recordings.session import Session
 from recordings.tracks import ObjectShape, ObjectTrack
 
@@ -248,7 +248,7 @@ def test_a_disk_full_in_the_second_pass_is_one_message_and_keeps_all_before_it(
     def full(*_: Any) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr("processing.second_pass.write_masks", full)
+    monkeypatch.setattr("processing.stages.second_pass.write_masks", full)
     assert main([str(session), "--out", str(out)]) == 2
     assert "is full. Every finished stage is kept" in capsys.readouterr().err
     assert {p.name for p in out.iterdir()} == kept

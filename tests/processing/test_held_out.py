@@ -11,16 +11,16 @@ import pytest
 import trimesh
 
 from processing.config import Config
-from processing.cycle import Pass, certain_share, judged_pass, with_contact
+from processing.evaluate.truth import open_truth
 from processing.field.learn import LearnConfig
 from processing.field.train import FieldConfig
-from processing.held_out import Half, halves_of, held_out_losses, learned_by, why_no_halves
-from processing.masks import object_masks, static_scene
 from processing.pipeline import Run, start_run
-from processing.stage import Done
-from processing.truth import open_truth
+from processing.stages.cycle import Pass, certain_share, judged_pass, with_contact
+from processing.stages.held_out import Half, halves_of, held_out_losses, learned_by, why_no_halves
+from processing.stages.masks import object_masks, static_scene
+from processing.store import Done
 from recordings.progress import Silent
-from recordings.results import read_shape, read_track, write_shape, write_track
+from recordings.results.folder import read_shape, read_track, write_shape, write_track
 from recordings.session import Session
 from recordings.tracks import ObjectShape, ObjectTrack, Status
 

@@ -7,8 +7,8 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from processing.icp import IcpConfig, ShapeSurface, align_frame, align_frames, count_verdicts
-from processing.reproject import RaycastRenderer
+from processing.refine.icp import IcpConfig, ShapeSurface, align_frame, align_frames, count_verdicts
+from processing.sensor.render import RaycastRenderer
 from recordings.geometry import CameraModel
 from recordings.tracks import ObjectShape
 

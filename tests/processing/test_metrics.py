@@ -8,7 +8,7 @@ import trimesh
 from hypothesis import given
 from hypothesis import strategies as st
 
-from processing.metrics import (
+from processing.evaluate.metrics import (
     align_first,
     auc_percent,
     chamfer,

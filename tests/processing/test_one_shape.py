@@ -11,12 +11,12 @@ import pytest
 
 from processing import pipeline
 from processing.config import Config
-from processing.one_shape import _fused_stage, _left, of_one_shape
 from processing.pipeline import Run, start_run
-from processing.stage import Done
+from processing.stages.one_shape import _fused_stage, _left, of_one_shape
+from processing.store import Done
 from recordings.geometry import rotation_exp
 from recordings.progress import Silent
-from recordings.results import write_masks, write_track
+from recordings.results.folder import write_masks, write_track
 from recordings.session import Session
 from recordings.tracks import ObjectTrack
 

@@ -14,16 +14,24 @@ import trimesh
 from PIL import Image
 
 from processing.cli import _parser
-from processing.metrics import FrameErrors
-from processing.report import write_report
-from processing.report_loops import SLOWED, chosen_frames, flight_cut, loop_images, toss_loops
-from processing.report_mesh import MOST_FACES, thinned
-from processing.report_shapes import UNSEEN_RGB, Shown
-from processing.report_worst import Evidence, lost_runs, reasons, worst_frames
-from processing.score import TossScore, VariantScore
-from processing.table import Row, table_document
-from recordings.film import STATUS_RGB
-from recordings.results import Results, TossRecord, VariantRecord, write_masks, write_shape, write_track, write_variant
+from processing.evaluate.metrics import FrameErrors
+from processing.evaluate.report import write_report
+from processing.evaluate.report_loops import SLOWED, chosen_frames, flight_cut, loop_images, toss_loops
+from processing.evaluate.report_mesh import MOST_FACES, thinned
+from processing.evaluate.report_shapes import UNSEEN_RGB, Shown
+from processing.evaluate.report_worst import Evidence, lost_runs, reasons, worst_frames
+from processing.evaluate.score import TossScore, VariantScore
+from processing.evaluate.table import Row, table_document
+from recordings.film.film import STATUS_RGB
+from recordings.results.folder import (
+    Results,
+    TossRecord,
+    VariantRecord,
+    write_masks,
+    write_shape,
+    write_track,
+    write_variant,
+)
 from recordings.session import Session
 from recordings.tracks import ObjectShape, ObjectTrack
 

@@ -7,7 +7,7 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from processing.reproject import RaycastRenderer, make_renderer, reproject
+from processing.sensor.render import RaycastRenderer, make_renderer, reproject
 from recordings.geometry import CameraModel
 from recordings.records import RgbdFrame
 from recordings.tracks import ObjectShape

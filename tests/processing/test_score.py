@@ -15,20 +15,12 @@ import numpy as np
 import pytest
 import trimesh
 
-from processing.score import VariantScore, score_variant
-from processing.table import collect, markdown, table_document
-from processing.truth import Truth
+from processing.evaluate.score import VariantScore, score_variant
+from processing.evaluate.table import collect, markdown, table_document
+from processing.evaluate.truth import Truth
 from recordings.exporters.tum import export_tum
 from recordings.geometry import CameraModel, rotation_exp
-from recordings.results import (
-    Results,
-    Scope,
-    TossRecord,
-    VariantRecord,
-    write_shape,
-    write_track,
-    write_variant,
-)
+from recordings.results.folder import Results, Scope, TossRecord, VariantRecord, write_shape, write_track, write_variant
 from recordings.tracks import ObjectShape, ObjectTrack, RigCalibration, Status
 
 ROOT = Path(__file__).resolve().parents[2]

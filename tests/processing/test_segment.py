@@ -10,10 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from processing.segment.background import BackgroundSegmenter, BackgroundSettings
-from processing.segment.foreground import fill_holes, largest_component, shadow_distance
-from processing.segment.segmenter import Example
-from processing.segment.static_scene import (
+from processing.segment.background.foreground import fill_holes, largest_component, shadow_distance
+from processing.segment.background.segmenter import BackgroundSegmenter, BackgroundSettings
+from processing.segment.background.static_scene import (
     SceneSettings,
     StaticScene,
     calibrated_table_depth,
@@ -21,6 +20,7 @@ from processing.segment.static_scene import (
     learn_scene,
     sample_positions,
 )
+from processing.segment.segmenter import Example
 from recordings.errors import BadInput
 from recordings.geometry import rotation_exp
 from recordings.progress import Silent

@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from processing.stage import Store, fingerprint
+from processing.store import Store, fingerprint
 from recordings.errors import BadInput, WriteFailed
 
 

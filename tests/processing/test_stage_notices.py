@@ -16,13 +16,13 @@ import pytest
 
 from processing import stage_notices
 from processing.cli import config_of, main
-from processing.contact.result import left_out_notice
-from processing.cycle import _said
+from processing.contact.report.result import left_out_notice
+from processing.evaluate.table import summary
 from processing.field.learn import LearnConfig
 from processing.field.train import FieldConfig
-from processing.second_pass import CycleConfig
-from processing.stage import Done
-from processing.table import summary
+from processing.stages.cycle import _said
+from processing.stages.second_pass import CycleConfig
+from processing.store import Done
 from recordings.importers.folder import import_folder
 from recordings.notices import Notice
 from recordings.records import ArmStates

@@ -15,11 +15,11 @@ from processing.config import Config
 from processing.field.learn import LearnConfig
 from processing.field.train import FieldConfig
 from processing.pipeline import process, start_run
-from processing.still import StillSettings, kept_of, still_stretches
+from processing.sensor.still import StillSettings, kept_of, still_stretches
 from processing.variants import rows_of
 from recordings.progress import Silent
 from recordings.records import RgbdFrame
-from recordings.results import Results
+from recordings.results.folder import Results
 from recordings.session import Session
 
 SETTINGS = StillSettings()

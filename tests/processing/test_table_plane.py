@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from processing.table_plane import fitted_plane, with_table_from_depth
+from processing.sensor.table_plane import fitted_plane, with_table_from_depth
 from recordings.errors import BadInput
 from recordings.tracks import RigCalibration
 

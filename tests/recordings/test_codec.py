@@ -12,11 +12,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from recordings import arm_codec, codec
-from recordings.depth_codec import pack_depth, unpack_depth
 from recordings.errors import BadInput, DamagedFile
 from recordings.geometry import rotation_exp
-from recordings.mcap_file import Message
+from recordings.mcap import arm_codec, codec
+from recordings.mcap.depth_codec import pack_depth, unpack_depth
+from recordings.mcap.file import Message
 from recordings.records import ArmStates, DepthImage, EncodedImage, HealthLine, StampedPose, TossCommand, TossEvent
 
 DEPTH_FOLDERS = ("cube_dev/toss_01/depth", "lab_dev/toss_00/depth", "jack_push/depth")

@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from recordings.codec import decode_image
 from recordings.errors import TosslabError
-from recordings.mcap_file import McapFile
-from recordings.recover import recover_file
+from recordings.mcap.codec import decode_image
+from recordings.mcap.file import McapFile
+from recordings.mcap.recover import recover_file
 from recordings.session import Session
-from recordings.verify import verify
-from recordings.verify_structure import check_structure
+from recordings.verify.structure import check_structure
+from recordings.verify.verify import verify
 
 LONGEST_S = 1.0
 Content = frozenset[tuple[object, ...]]

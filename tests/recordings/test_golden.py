@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from recordings.codec import decode_image
 from recordings.documents import FORMAT_VERSION
+from recordings.mcap.codec import decode_image
 from recordings.records import HealthLine, TossEvent
 from recordings.session import Session
-from recordings.verify import verify
+from recordings.verify.verify import verify
 
 GOLDEN = Path(__file__).parent / "golden"
 VERSIONS = sorted(p.name for p in GOLDEN.iterdir() if p.is_dir())

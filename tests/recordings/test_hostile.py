@@ -18,11 +18,11 @@ from typing import Any
 
 import pytest
 
-from recordings.codec import decode_image, decode_mask
 from recordings.documents import parse_json
 from recordings.errors import BadInput, DamagedFile
 from recordings.importers.images import read_depth_png
 from recordings.limits import Budget, image_size, unpack
+from recordings.mcap.codec import decode_image, decode_mask
 from recordings.records import EncodedImage
 
 MOST_BYTES = 1 << 30
@@ -32,10 +32,10 @@ import gc, json, os, resource, sys, time
 from pathlib import Path
 import cv2, lz4.frame, numpy, rosbags.rosbag1, rosbags.rosbag2, rosbags.typesys, scipy.spatial.transform, trimesh, yaml
 from recordings.errors import TosslabError
-import recordings.importers.ros_bounds, recordings.importers.realsense, recordings.verify, recordings.recover
+import recordings.importers.ros_bounds, recordings.importers.realsense, recordings.verify.verify, recordings.mcap.recover
 import recordings.importers.folder, recordings.importers.bundlesdf, recordings.importers.contactnets
-import recordings.importers.rosbag, groundtruth.detections, groundtruth.tagslam_yaml
-import recordings.collada, recordings.robot
+import recordings.importers.rosbag, groundtruth.tagslam.detections, groundtruth.tagslam.yaml_pieces
+import recordings.robot.collada, recordings.robot.arm
 
 def attempt(imports, call, path):
     for limit, most in ((resource.RLIMIT_AS, 16 << 30), (resource.RLIMIT_CPU, 60)):
@@ -65,15 +65,15 @@ for line in sys.stdin:
         print(json.dumps([0, 0, f"CRASHED with status {status}"]), flush=True)
 """
 READERS = {
-    "verify": ("from recordings.verify import verify", "verify(path)"),
-    "info": ("from recordings.inspect import inspect", "inspect(path)"),
+    "verify": ("from recordings.verify.verify import verify", "verify(path)"),
+    "info": ("from recordings.verify.inspect import inspect", "inspect(path)"),
     "open": (
         "from recordings.session import Session",
         "toss = Session.open(path).toss(0); [toss.file.read('/d455/color', i) for i in range(3)]",
     ),
-    "recover": ("from recordings.recover import recover_file", "recover_file(path, out)"),
+    "recover": ("from recordings.mcap.recover import recover_file", "recover_file(path, out)"),
     "mcap": (
-        "from recordings.mcap_file import McapFile",
+        "from recordings.mcap.file import McapFile",
         "file = McapFile(path); [file.read('/d455/color', i) for i in range(3)]",
     ),
     "session": ("from recordings.session import Session", "Session.open(path.parent)"),
@@ -87,20 +87,20 @@ READERS = {
     ),
     "rosbag": ("from recordings.importers.rosbag import import_rosbag", "import_rosbag([path], out)"),
     "realsense": ("from recordings.importers.realsense import import_realsense", "import_realsense([path], out)"),
-    "tagslam yaml": ("from groundtruth.tagslam_yaml import load", "load(path)"),
-    "tagslam bag": ("from groundtruth.detections import read_recording", "read_recording(path.parent)"),
+    "tagslam yaml": ("from groundtruth.tagslam.yaml_pieces import load", "load(path)"),
+    "tagslam bag": ("from groundtruth.tagslam.detections import read_recording", "read_recording(path.parent)"),
     "truth folder": (
         "from recordings.importers.truth_folder import read_truth_folder",
         "read_truth_folder(path.parent.parent)",
     ),
-    "tracks": ("from recordings.results import read_track", "read_track(path.parent, 0)"),
-    "hand": ("from recordings.results import read_hand", "read_hand(path.parent, 0)"),
-    "shape": ("from recordings.results import read_shape", "read_shape(path.parent)"),
-    "results": ("from recordings.results import Results", "Results.open(path.parent.parent)"),
+    "tracks": ("from recordings.results.folder import read_track", "read_track(path.parent, 0)"),
+    "hand": ("from recordings.results.folder import read_hand", "read_hand(path.parent, 0)"),
+    "shape": ("from recordings.results.folder import read_shape", "read_shape(path.parent)"),
+    "results": ("from recordings.results.folder import Results", "Results.open(path.parent.parent)"),
     "mesh": ("from recordings.mesh_file import load_mesh", "load_mesh(path)"),
-    "urdf": ("from recordings.robot import read_urdf", "read_urdf(path)"),
-    "collada": ("from recordings.collada import read_collada", "read_collada(path)"),
-    "weights": ("from processing.weights import XFEAT, read_weights", "read_weights(path, XFEAT)"),
+    "urdf": ("from recordings.robot.arm import read_urdf", "read_urdf(path)"),
+    "collada": ("from recordings.robot.collada import read_collada", "read_collada(path)"),
+    "weights": ("from processing.published_weights import XFEAT, read_weights", "read_weights(path, XFEAT)"),
 }
 
 

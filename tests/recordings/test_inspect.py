@@ -11,8 +11,8 @@ from mcap.writer import Writer as PlainWriter
 
 from recordings.cli_session import main
 from recordings.errors import BadInput, DamagedFile
-from recordings.inspect import inspect
 from recordings.session_writer import SessionWriter
+from recordings.verify.inspect import inspect
 
 
 def test_streams_rates_events_and_calibration_age_are_told(write_session, small_rig):

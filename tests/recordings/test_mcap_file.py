@@ -12,8 +12,8 @@ from mcap.writer import CompressionType
 from mcap.writer import Writer as PlainWriter
 
 from recordings.errors import BadInput, DamagedFile
-from recordings.mcap_file import McapFile
-from recordings.mcap_writer import McapWriter
+from recordings.mcap.file import McapFile
+from recordings.mcap.writer import McapWriter
 
 COUNT, SIZE = 400, 50_000
 

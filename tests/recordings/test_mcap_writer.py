@@ -16,10 +16,10 @@ from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 
 from recordings.errors import BadInput, WriteFailed
-from recordings.mcap_file import McapFile
-from recordings.mcap_writer import CHUNK_BYTES, CHUNK_NS, McapWriter
-from recordings.recover import recover_file
-from recordings.verify_structure import check_structure
+from recordings.mcap.file import McapFile
+from recordings.mcap.recover import recover_file
+from recordings.mcap.writer import CHUNK_BYTES, CHUNK_NS, McapWriter
+from recordings.verify.structure import check_structure
 
 
 def filled(path: Path, count: int = 10, size: int = 100, step_ns: int = 1_000_000) -> str:

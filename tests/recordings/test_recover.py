@@ -13,13 +13,13 @@ from mcap.writer import Writer as PlainWriter
 
 from recordings.cli_session import main
 from recordings.errors import BadInput, WriteFailed
-from recordings.mcap_file import McapFile
-from recordings.mcap_writer import McapWriter
-from recordings.recover import missing_numbers, recover_file
+from recordings.mcap.file import McapFile
+from recordings.mcap.recover import missing_numbers, recover_file
+from recordings.mcap.writer import McapWriter
 from recordings.recover_session import recover
 from recordings.session import Session
-from recordings.verify import verify
-from recordings.verify_structure import check_structure
+from recordings.verify.structure import check_structure
+from recordings.verify.verify import verify
 
 
 def sequences(path: Path, topic: str = "/a") -> list[int]:

@@ -10,7 +10,7 @@ import pytest
 
 from recordings.errors import BadInput, DamagedFile
 from recordings.geometry import CameraModel, Transform, rotation_exp
-from recordings.results import (
+from recordings.results.folder import (
     Results,
     TossRecord,
     VariantRecord,
@@ -26,7 +26,7 @@ from recordings.results import (
     write_track,
     write_variant,
 )
-from recordings.shape_file import obj_text
+from recordings.results.shape_file import obj_text
 from recordings.tracks import ContactModel, ObjectShape, ObjectTrack, RigCalibration
 
 CAMERA = CameraModel("d455", 8, 6, np.array([[5.0, 0, 3.5], [0, 5.0, 2.5], [0, 0, 1]]))

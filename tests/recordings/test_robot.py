@@ -8,9 +8,9 @@ import re
 import numpy as np
 import pytest
 
-from recordings.collada import read_collada
 from recordings.errors import BadInput
-from recordings.robot import PANDA_TOOL, panda, panda_urdf, read_urdf
+from recordings.robot.arm import PANDA_TOOL, panda, panda_urdf, read_urdf
+from recordings.robot.collada import read_collada
 
 READY = np.array([0.1, -0.4, 0.2, -2.1, 0.3, 2.0, 0.7])
 

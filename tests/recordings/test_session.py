@@ -12,16 +12,16 @@ import numpy as np
 import pytest
 from mcap.writer import Writer as PlainWriter
 
-from recordings.codec import decode_image
 from recordings.errors import BadInput, DamagedFile, TosslabError, WriteFailed
 from recordings.geometry import CameraModel, Transform
-from recordings.inspect import inspect
+from recordings.mcap.codec import decode_image
 from recordings.records import EncodedImage, TossWindow
 from recordings.recover_session import recover
 from recordings.session import Session
 from recordings.session_writer import SessionWriter, TossWriter
 from recordings.tracks import RigCalibration
-from recordings.verify import verify
+from recordings.verify.inspect import inspect
+from recordings.verify.verify import verify
 
 
 def test_every_record_comes_back_as_it_was_written(write_session, small_rig):

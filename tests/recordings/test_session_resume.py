@@ -8,7 +8,7 @@ from recordings.errors import BadInput
 from recordings.session import Session
 from recordings.session_resume import next_toss, resume_session
 from recordings.session_writer import SessionWriter
-from recordings.verify import verify
+from recordings.verify.verify import verify
 
 
 def cut_off(tmp_path, rig, keep: int):

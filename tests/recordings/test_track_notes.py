@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from recordings.errors import DamagedFile
-from recordings.results import Results
-from recordings.track_notes import Matches, Rejected, find_notes, read_notes, write_notes
+from recordings.results.folder import Results
+from recordings.results.track_notes import Matches, Rejected, find_notes, read_notes, write_notes
 
 REJECTED = Rejected(np.array([1, 1, 2]), np.tile(np.eye(4), (3, 1, 1)), np.array([0.3, 0.4, 0.5]))
 MATCHES = Matches(np.array([[1, 0], [2, 0]]), np.arange(12.0).reshape(2, 2, 3), np.array([True, False]))

@@ -19,7 +19,7 @@ from recordings.records import StampedPose
 from recordings.session import Session
 from recordings.session_writer import SessionWriter, write_truth
 from recordings.tracks import RigCalibration
-from recordings.verify import Report, verify
+from recordings.verify.verify import Report, verify
 
 
 def texts(report: Report, severity: str) -> str:

@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Float32
 from numpy import ndarray as Array
 
-from acquisition.synthetic.paint import Gloss, PaintedMesh, assemble
-from acquisition.synthetic.solids import Solid
-from acquisition.synthetic.textures import noise
+from acquisition.synthetic.objects.paint import Gloss, PaintedMesh, assemble
+from acquisition.synthetic.objects.solids import Solid
+from acquisition.synthetic.objects.textures import noise
 
 KINDS = ("plain", "label", "pattern", "printed", "dense")
 ALBEDO = (0.05, 0.9)

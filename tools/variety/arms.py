@@ -10,9 +10,9 @@ from numpy import ndarray as Array
 
 from acquisition.synthetic.arm import FORWARD_S, Arm, Swing
 from acquisition.synthetic.config import ArmConfig
-from acquisition.synthetic.grasp import PAD_OVERLAP_M, WIDEST_M, Grasp
 from acquisition.synthetic.motion import Release, Trajectory
-from acquisition.synthetic.rays import Placed
+from acquisition.synthetic.objects.grasp import PAD_OVERLAP_M, WIDEST_M, Grasp
+from acquisition.synthetic.render.rays import Placed
 from recordings.geometry import Transform
 from variety.appearance import Finish
 from variety.furniture import Item

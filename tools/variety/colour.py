@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Float32
 from numpy import ndarray as Array
 
-from acquisition.synthetic.sensors import color_image
+from acquisition.synthetic.render.sensors import color_image
 from recordings.errors import BadInput
 from recordings.geometry import CameraModel, Transform
 from variety.furniture import Item

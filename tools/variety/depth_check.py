@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float32
 from numpy import ndarray as Array
 
 from acquisition.synthetic.config import DepthConfig
-from acquisition.synthetic.sensors import DepthSensor
+from acquisition.synthetic.render.sensors import DepthSensor
 from recordings.geometry import Transform
 from variety import appearance, stereo_depth
 from variety.furniture import Item, colored, painted, placed, sheet

@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray as Array
 
-from acquisition.synthetic.paint import Gloss, PaintedMesh, assemble
-from acquisition.synthetic.solids import Chart, Solid, extrude
-from acquisition.synthetic.textures import noise
+from acquisition.synthetic.objects.paint import Gloss, PaintedMesh, assemble
+from acquisition.synthetic.objects.solids import Chart, Solid, extrude
+from acquisition.synthetic.objects.textures import noise
 from recordings.geometry import Transform, rotation_exp
 from variety import appearance, shapes
 from variety.appearance import Finish

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 from numpy import ndarray as Array
 
-from acquisition.synthetic.rays import Body, Placed, Standing, cast, occluded, surface
+from acquisition.synthetic.render.rays import Body, Placed, Standing, cast, occluded, surface
 from recordings.geometry import Transform
 from variety.furniture import Item
 from variety.spec import DepthSpec

@@ -12,11 +12,11 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray as Array
 
-from processing.learned_values import learned_values
-from processing.score import Value, chamfers, score_variant, true_mesh
-from processing.truth import Truth, open_truth
+from processing.evaluate.learned_values import learned_values
+from processing.evaluate.score import Value, chamfers, score_variant, true_mesh
+from processing.evaluate.truth import Truth, open_truth
 from recordings.geometry import rotation_log
-from recordings.results import Results, VariantRecord
+from recordings.results.folder import Results, VariantRecord
 from recordings.session import Session
 from recordings.tracks import ObjectTrack
 
@@ -155,8 +155,8 @@ def fusion_floor_cm(session_path: Path, truth_path: Path, place: Path) -> float 
     from processing.field.fuse import fuse
     from processing.field.learn import TossViews, chosen_views
     from processing.field.mesh import grid_mesh
-    from processing.frames import with_depth_scale
     from processing.pipeline import start_run
+    from processing.sensor.frames import with_depth_scale
     from recordings.errors import BadInput
     from recordings.progress import Silent
 

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray as Array
 
-from acquisition.synthetic.objects import MassProperties
+from acquisition.synthetic.objects.shapes import MassProperties
 from recordings.errors import BadInput
 
 

@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray as Array
 
-from acquisition.synthetic.paint import Gloss, PaintedMesh
-from acquisition.synthetic.solids import corner_normals
+from acquisition.synthetic.objects.paint import Gloss, PaintedMesh
+from acquisition.synthetic.objects.solids import corner_normals
 from recordings.errors import BadInput
 
 SUFFIXES = (".obj", ".ply", ".glb")

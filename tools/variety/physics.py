@@ -14,7 +14,7 @@ from jaxtyping import Float
 from numpy import ndarray as Array
 
 from acquisition.synthetic.motion import Release, Trajectory
-from acquisition.synthetic.objects import MassProperties
+from acquisition.synthetic.objects.shapes import MassProperties
 from recordings.geometry import rotation_from_quaternion
 
 STILL_M_S, STILL_RAD_S, STILL_FOR_S = 0.01, 0.15, 0.1

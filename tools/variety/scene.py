@@ -11,9 +11,9 @@ from jaxtyping import Float, Float32
 from numpy import ndarray as Array
 
 from acquisition.synthetic.arm import Arm
-from acquisition.synthetic.cameras import look_at
 from acquisition.synthetic.config import CameraConfig
-from acquisition.synthetic.objects import MassProperties
+from acquisition.synthetic.objects.shapes import MassProperties
+from acquisition.synthetic.render.cameras import look_at
 from recordings.geometry import CameraModel, Transform
 from variety import appearance, arms, furniture, masses, shapes
 from variety.furniture import Item

@@ -14,10 +14,10 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray as Array
 
-from acquisition.synthetic.chance import small_error
 from acquisition.synthetic.folder import PIXEL_CONVENTION, STATES_HZ, TRUTH_SUFFIX
-from acquisition.synthetic.rays import Body, Placed, Standing, cast
-from acquisition.synthetic.sensors import color_image
+from acquisition.synthetic.random_draws import small_error
+from acquisition.synthetic.render.rays import Body, Placed, Standing, cast
+from acquisition.synthetic.render.sensors import color_image
 from recordings.errors import BadInput
 from recordings.geometry import CameraModel, Transform
 from recordings.progress import Progress, Silent

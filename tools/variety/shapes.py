@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray as Array
 
-from acquisition.synthetic.solids import Chart, Solid, extrude, flat_chart, sweep
+from acquisition.synthetic.objects.solids import Chart, Solid, extrude, flat_chart, sweep
 
 LONGEST_M = (0.04, 0.20)
 CELLS = 80

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from acquisition.simulators.apart import Apart
+from acquisition.simulators.child_process import Apart
 from acquisition.simulators.gige import PROGRAM
 from acquisition.simulators.network import NotPermitted, own_network
 from recordings.records import ArmStates

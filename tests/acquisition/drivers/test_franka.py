@@ -11,7 +11,7 @@ import pytest
 from acquisition.devices import ArmSamples, DeviceRefused, GripperSample, JointTrajectory
 from acquisition.drivers.franka import FrankaArm, not_opened
 from acquisition.drivers.franka_hand import FrankaHand
-from acquisition.simulators.apart import Apart
+from acquisition.simulators.child_process import Apart
 from recordings.errors import DeviceNotFound
 
 SWING_RAD = np.array([0.3, 0.5, 0.0, 0.7, 0.0, 0.4, 0.0])

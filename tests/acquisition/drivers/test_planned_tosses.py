@@ -12,28 +12,28 @@ import numpy as np
 import pytest
 
 from acquisition import preflight
-from acquisition.approach import plan_approach
-from acquisition.arm_thrower import ArmThrower, base_in_world
+from acquisition.arm.approach import plan_approach
+from acquisition.arm.limits import ArmModel, arm_model
+from acquisition.arm.thrower import ArmThrower, base_in_world
+from acquisition.arm.toss import ReleaseDelay, TossPlan, TossTarget, plan_toss
+from acquisition.arm.workspace import Space
 from acquisition.cli import main
-from acquisition.clock import SessionClock
 from acquisition.devices import Arm, ArmSamples
 from acquisition.drivers.franka import FrankaArm
 from acquisition.drivers.ur import UrArm
 from acquisition.operator import Nobody
-from acquisition.recorder import Recorder
 from acquisition.rig import find_rig, read_rig
 from acquisition.run import Options, SessionRun
 from acquisition.setup import NO_CALIBRATION, make_device
-from acquisition.simulators.apart import Apart
-from acquisition.toss import ReleaseDelay, TossPlan, TossTarget, plan_toss
-from acquisition.toss_limits import ArmModel, arm_model
-from acquisition.workspace import Space
+from acquisition.simulators.child_process import Apart
+from acquisition.streaming.clock import SessionClock
+from acquisition.streaming.recorder import Recorder
 from recordings.geometry import Transform, rotation_exp
 from recordings.progress import Silent
 from recordings.session import Session
 from recordings.session_writer import SessionWriter
 from recordings.tracks import RigCalibration
-from recordings.verify import verify
+from recordings.verify.verify import verify
 
 SPACE = Space.of_table(Transform("world", "base", np.eye(3), np.zeros(3)))
 DELAY = ReleaseDelay(0.06, 0.01)

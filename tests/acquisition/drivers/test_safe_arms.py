@@ -10,20 +10,20 @@ from typing import Any
 import numpy as np
 import pytest
 
-from acquisition.approach import plan_approach
-from acquisition.arm_thrower import ArmThrower
+from acquisition.arm.approach import plan_approach
+from acquisition.arm.limits import arm_model
+from acquisition.arm.thrower import ArmThrower
+from acquisition.arm.workspace import Space
 from acquisition.cli import main
-from acquisition.clock import SessionClock
 from acquisition.devices import ArmSamples, DeviceRefused, JointTrajectory
 from acquisition.drivers import franka
 from acquisition.drivers.franka import FrankaArm
 from acquisition.drivers.ur import UrArm
 from acquisition.operator import Nobody
-from acquisition.recorder import Recorder
 from acquisition.rig import DeviceEntry, Rig, TossConfig
-from acquisition.simulators.apart import Apart
-from acquisition.toss_limits import arm_model
-from acquisition.workspace import Space
+from acquisition.simulators.child_process import Apart
+from acquisition.streaming.clock import SessionClock
+from acquisition.streaming.recorder import Recorder
 from recordings.errors import TosslabError
 from recordings.geometry import Transform
 from recordings.progress import Silent

@@ -11,7 +11,7 @@ import pytest
 from acquisition.devices import ArmSamples, DeviceRefused, JointTrajectory
 from acquisition.drivers import ur
 from acquisition.drivers.ur import UrArm
-from acquisition.simulators.apart import Apart
+from acquisition.simulators.child_process import Apart
 from recordings.errors import DeviceNotFound
 
 SWING_RAD = np.array([0.3, 0.4, 0.0, 0.6, 0.0, 0.3])

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from acquisition.devices import DeviceLost
-from acquisition.drivers.worker import Worker
+from acquisition.drivers.workers.process import Worker
 
 CHILD = """
 import sys, time

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from acquisition.simulators import fci_wire, rtde_wire
-from acquisition.simulators.apart import Apart, SimulatorFailed
+from acquisition.simulators.child_process import Apart, SimulatorFailed
 from acquisition.simulators.faults import Faults
 from acquisition.simulators.fci import FciServer
 from acquisition.simulators.fci_body import TICK_S, FciBody

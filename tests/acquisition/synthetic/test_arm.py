@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from acquisition.synthetic.chance import generator
 from acquisition.synthetic.lab import Lab
+from acquisition.synthetic.random_draws import generator
 from recordings.geometry import rotation_angle_rad
-from recordings.robot import PANDA_TOOL, panda
+from recordings.robot.arm import PANDA_TOOL, panda
 
 
 @pytest.fixture(scope="module")

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import trimesh
 
-from acquisition.synthetic import objects
 from acquisition.synthetic.config import ObjectConfig
-from acquisition.synthetic.grasp import WIDEST_M, grasp
-from acquisition.synthetic.paint import paint_object
-from acquisition.synthetic.solids import corner_normals
+from acquisition.synthetic.objects import shapes as objects
+from acquisition.synthetic.objects.grasp import WIDEST_M, grasp
+from acquisition.synthetic.objects.paint import paint_object
+from acquisition.synthetic.objects.solids import corner_normals
 from recordings.errors import BadInput
 
 SHAPES = list(objects.USUAL_SIZE_M)

@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
-from acquisition.synthetic.chance import exposure_times
 from acquisition.synthetic.lab import Lab
-from acquisition.synthetic.optics import jitters, picture, sight
+from acquisition.synthetic.random_draws import exposure_times
+from acquisition.synthetic.render.optics import jitters, picture, sight
 
 
 def outline(lab, motion, time_s):

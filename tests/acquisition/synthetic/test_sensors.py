@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from acquisition.synthetic import sensors
 from acquisition.synthetic.config import DepthConfig
-from acquisition.synthetic.sensors import DepthSensor, exposed, to_srgb
+from acquisition.synthetic.render import sensors
+from acquisition.synthetic.render.sensors import DepthSensor, exposed, to_srgb
 
 SHAPE = (240, 320)
 Z_M = 0.8

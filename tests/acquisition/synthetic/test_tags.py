@@ -11,9 +11,9 @@ import cv2
 import numpy as np
 import pytest
 
-from acquisition.synthetic import textures
 from acquisition.synthetic.board import board_pose, board_tags
-from acquisition.synthetic.rays import Placed
+from acquisition.synthetic.objects import textures
+from acquisition.synthetic.render.rays import Placed
 
 pytest.importorskip("pupil_apriltags")
 PUPIL_SHIFT_PX = 0.5

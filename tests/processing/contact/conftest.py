@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import torch
 
-from processing.contact.geometry import CORNERS
-from processing.contact.inertia import Physics, known_physics
-from processing.contact.loss import Body
-from processing.contact.motion import PoseSeries, rotation_matrices
-from processing.contact.rollout import Start, simulate
+from processing.contact.physics.geometry import CORNERS
+from processing.contact.physics.inertia import Physics, known_physics
+from processing.contact.physics.loss import Body
+from processing.contact.physics.rollout import Start, simulate
+from processing.motion.trajectory import PoseSeries, rotation_matrices
 
 HALF_M = np.array([0.05, 0.04, 0.03])
 STEP_S = 1 / 148

@@ -8,12 +8,12 @@ import pytest
 import torch
 
 from processing.contact.command import PoseSource, chosen, contact_only, find_poses, in_frame_of
-from processing.contact.geometry import CORNERS
-from processing.contact.motion import rotation_matrices
+from processing.contact.physics.geometry import CORNERS
+from processing.motion.trajectory import rotation_matrices
 from recordings.errors import BadInput
 from recordings.geometry import Transform
 from recordings.records import StampedPose
-from recordings.results import Results
+from recordings.results.folder import Results
 from recordings.session import Session
 from recordings.session_writer import SessionWriter
 from recordings.tracks import ObjectShape, RigCalibration
@@ -184,9 +184,9 @@ def test_more_steps_than_any_toss_has_end_with_the_longest_one_and_it_is_said(po
 def test_errors_are_drawn_of_rollouts_that_go_on_after_every_toss(tmp_path):
     from matplotlib.figure import Figure
 
-    from processing.contact.evaluate import Evaluation, summarise
-    from processing.contact.figure import draw_errors
-    from processing.contact.rollout import Rollout, RolloutErrors, Start
+    from processing.contact.physics.rollout import Rollout, RolloutErrors, Start
+    from processing.contact.report.figure import draw_errors
+    from processing.contact.report.rollout_errors import Evaluation, summarise
 
     ended = np.where(np.arange(80) < 40, 0.01, np.nan) * np.ones((3, 1))
     errors = RolloutErrors((0, 1, 2), 1 / 148, ended, ended, 0)

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from processing.contact import data_checks as checks
-from processing.contact.learn import learn_contact
-from processing.contact.motion import PoseSeries, differences
-from processing.contact.plane import Plane
-from processing.contact.prior import prior_from_size
+from processing.contact.learn import data_checks as checks
+from processing.contact.learn.learn import learn_contact
+from processing.contact.learn.prior import prior_from_size
+from processing.contact.physics.plane import Plane
+from processing.motion.trajectory import PoseSeries, differences
 from recordings.errors import BadInput
 
 
@@ -52,7 +52,7 @@ def test_a_jumping_toss_is_left_out_and_the_others_are_used(simulated_tosses, bo
     position = tracks[1].position_m.copy()
     position[50:] += [0.2, 0, 0]
     tracks[1] = replace(tracks[1], position_m=position)
-    from processing.contact.prepared import prepare
+    from processing.contact.learn.prepared import prepare
 
     prepared = prepare(tracks, prior_from_size("box", 0.08).frame, Plane(), box_physics.inertia_kgm2)
     assert [t.toss for t in prepared.tracks] == [0, 2]

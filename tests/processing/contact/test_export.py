@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from processing.contact.export import write_assets
-from processing.contact.geometry import CORNERS, hull_mesh
+from processing.contact.physics.geometry import CORNERS, hull_mesh
+from processing.contact.report.assets import write_assets
 from recordings.tracks import ContactModel, ObjectShape
 
 HALF_M = np.array([0.05, 0.04, 0.03])

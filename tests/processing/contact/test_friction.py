@@ -3,15 +3,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from processing.contact.forecast import MEMBERS, Course, Forecasts, Law, RigidBody
-from processing.contact.friction import frames_are_slow, friction_by_forecasts
-from processing.contact.motion import GRAVITY_M_S2, rotation_matrices
-from processing.contact.plane import Plane
-from processing.contact.prepared import prepare
-from processing.contact.prior import prior_from_size
-from processing.contact.rollout import Start, simulate, simulate_law
-from processing.contact.segment import Noise
-from processing.contact.steps_cpu import roll_rows
+from processing.contact.friction.estimate import frames_are_slow, friction_by_forecasts
+from processing.contact.friction.forecast import MEMBERS, Course, Forecasts, Law, RigidBody
+from processing.contact.learn.prepared import prepare
+from processing.contact.learn.prior import prior_from_size
+from processing.contact.physics.plane import Plane
+from processing.contact.physics.rollout import Start, simulate, simulate_law
+from processing.contact.physics.steps_cpu import roll_rows
+from processing.motion.phases import Noise
+from processing.motion.trajectory import GRAVITY_M_S2, rotation_matrices
 
 BOX_FRICTION = 0.25
 

@@ -5,21 +5,21 @@ import numpy as np
 import pytest
 import trimesh
 
-from processing.contact.choice import choose_geometry, measured_prior
-from processing.contact.data_checks import OtherReading
-from processing.contact.evaluate import world_poses
-from processing.contact.figure4 import learn_figure_4
-from processing.contact.fit import FitConfig
-from processing.contact.from_tracks import TracksConfig, learn_from_tracks
 from processing.contact.fuse import Field, FusionConfig, Readings, Sizes, Surface, likely_sizes
-from processing.contact.inertia import uniform_physics
-from processing.contact.judge import contact_loss_of, mean_loss_j, uniform_model
-from processing.contact.learn import ContactConfig
-from processing.contact.loss import Weights
-from processing.contact.motion import PoseSeries, rotation_matrices
-from processing.contact.plane import Plane, calibrated_plane
-from processing.contact.support import trimmed_hull, volume_m3
-from processing.metrics import rollout_errors
+from processing.contact.learn.convexity import choose_geometry, measured_prior
+from processing.contact.learn.data_checks import OtherReading
+from processing.contact.learn.fit import FitConfig
+from processing.contact.learn.from_tracks import TracksConfig, learn_from_tracks
+from processing.contact.learn.learn import ContactConfig
+from processing.contact.learn.shape_comparison import contact_loss_of, mean_loss_j, uniform_model
+from processing.contact.physics.inertia import uniform_physics
+from processing.contact.physics.loss import Weights
+from processing.contact.physics.plane import Plane, calibrated_plane
+from processing.contact.physics.support import trimmed_hull, volume_m3
+from processing.contact.report.figure4 import learn_figure_4
+from processing.contact.report.rollout_errors import world_poses
+from processing.evaluate.metrics import rollout_errors
+from processing.motion.trajectory import PoseSeries, rotation_matrices
 from recordings.errors import BadInput
 from recordings.geometry import Transform
 from recordings.tracks import ObjectShape, ObjectTrack, RigCalibration
@@ -134,7 +134,7 @@ def test_tracks_whose_impacts_fit_another_reading_are_said_to_be_off(simulated_t
     def refused(*_):
         raise OtherReading(0.45, 0.1, "quaternions stored as x y z w")
 
-    monkeypatch.setattr("processing.contact.data_checks.check_orientations", refused)
+    monkeypatch.setattr("processing.contact.learn.data_checks.check_orientations", refused)
     with pytest.raises(BadInput, match="most likely its orientation is off") as wrong:
         learn_from_tracks(tracks_of(simulated_tosses(2, 130)), noisy_box(), WORLD_FROM_CAMERA, config=QUICK)
     assert "import" not in str(wrong.value)
@@ -150,8 +150,8 @@ def test_a_plane_that_contradicts_what_the_camera_saw_is_refused(simulated_tosse
 def test_spikes_below_the_table_do_not_keep_contact_out(simulated_tosses):
     """Six blobs of 9 mm on each face, as a field leaves them: the lowest vertex is far below the table at rest, the
     surface is not. A shape that is sunk as a whole is still refused."""
-    from processing.contact.data_checks import lowest_point_m
-    from processing.contact.segment import find_phases
+    from processing.contact.learn.data_checks import lowest_point_m
+    from processing.motion.phases import find_phases
 
     shape, series = noisy_box(), simulated_tosses(4, 130)
     rng = np.random.default_rng(3)

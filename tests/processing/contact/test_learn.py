@@ -6,19 +6,19 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from processing.contact.evaluate import evaluate, summarise
-from processing.contact.fit import Fit, FitConfig, Model, fit
-from processing.contact.geometry import SCALE_M, Box, FreePoints, hull_mesh, hull_of, sphere
-from processing.contact.inertia import inertia_from, known_physics, physics_of_session, uniform_physics
-from processing.contact.intervals import Interval
-from processing.contact.learn import ContactConfig, learn_contact
-from processing.contact.loss import StepData, Weights
-from processing.contact.motion import PoseSeries, rotation_matrices
-from processing.contact.pieces import carried, convex_pieces
-from processing.contact.plane import Plane
-from processing.contact.prepared import prepare, transitions
-from processing.contact.prior import prior_from_shape, prior_from_size
-from processing.contact.weights import Candidate, choose
+from processing.contact.learn.dissipation_weight import Candidate, choose
+from processing.contact.learn.fit import Fit, FitConfig, Model, fit
+from processing.contact.learn.intervals import Interval
+from processing.contact.learn.learn import ContactConfig, learn_contact
+from processing.contact.learn.prepared import prepare, transitions
+from processing.contact.learn.prior import prior_from_shape, prior_from_size
+from processing.contact.physics.geometry import SCALE_M, Box, FreePoints, hull_mesh, hull_of, sphere
+from processing.contact.physics.inertia import inertia_from, known_physics, physics_of_session, uniform_physics
+from processing.contact.physics.loss import StepData, Weights
+from processing.contact.physics.pieces import carried, convex_pieces
+from processing.contact.physics.plane import Plane
+from processing.contact.report.rollout_errors import evaluate, summarise
+from processing.motion.trajectory import PoseSeries, rotation_matrices
 from recordings.errors import BadInput
 from recordings.tracks import ObjectShape
 
@@ -79,9 +79,9 @@ def test_plane_and_size_together_are_refused(box_physics):
 
 
 def test_the_plane_is_learned_where_the_shape_is_known(simulated_tosses, box_physics):
-    from processing.contact.fit import fit
-    from processing.contact.loss import StepData
-    from processing.contact.motion import differences, steps_of
+    from processing.contact.learn.fit import fit
+    from processing.contact.physics.loss import StepData
+    from processing.motion.trajectory import differences, steps_of
 
     config = FitConfig(learn_plane=True, learn_shape=False, friction_start=0.25)
     model = Model(Box(TRUE_EDGES_M / 2), box_physics.inertia_kgm2, config)

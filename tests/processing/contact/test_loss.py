@@ -6,10 +6,10 @@ import pytest
 import scipy.sparse
 import torch
 
-from processing.contact.fit import FRICTION, FitConfig, Model
-from processing.contact.geometry import Box
-from processing.contact.loss import Body, ContactTerms, StepData, Weights, contact_loss
-from processing.contact.motion import Steps, differences, steps_of
+from processing.contact.learn.fit import FRICTION, FitConfig, Model
+from processing.contact.physics.geometry import Box
+from processing.contact.physics.loss import Body, ContactTerms, StepData, Weights, contact_loss
+from processing.motion.trajectory import Steps, differences, steps_of
 
 CONTACTS = 4
 

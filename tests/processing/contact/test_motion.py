@@ -3,9 +3,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from processing.contact.motion import PoseSeries, differences, rotation_matrices, steps_of
-from processing.contact.segment import Noise, find_phases, pose_noise
-from processing.contact.smooth import smooth
+from processing.motion.phases import Noise, find_phases, pose_noise
+from processing.motion.smoother import smooth
+from processing.motion.trajectory import PoseSeries, differences, rotation_matrices, steps_of
 from recordings.errors import BadInput
 from recordings.records import StampedPose
 

@@ -4,7 +4,7 @@ import pytest
 import scipy.sparse
 import torch
 
-from processing.contact.solver import in_cone, project, project_jacobian, solve_batch, solve_cones
+from processing.contact.physics.solver import in_cone, project, project_jacobian, solve_batch, solve_cones
 
 
 def problems(count, contacts, seed):

@@ -3,15 +3,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from processing.contact import data_checks as checks
-from processing.contact.forecast import Law, RigidBody
-from processing.contact.geometry import CORNERS
-from processing.contact.learn import learn_contact
-from processing.contact.motion import rotation_matrices
-from processing.contact.plane_forecast import plane_by_forecasts
-from processing.contact.prior import prior_from_size
-from processing.contact.smooth import smooth
-from processing.contact.touch import Touches, hinge, plane_by_touch, touches
+from processing.contact.friction.forecast import Law, RigidBody
+from processing.contact.friction.plane_forecast import plane_by_forecasts
+from processing.contact.learn import data_checks as checks
+from processing.contact.learn.learn import learn_contact
+from processing.contact.learn.prior import prior_from_size
+from processing.contact.learn.touch import Touches, hinge, plane_by_touch, touches
+from processing.contact.physics.geometry import CORNERS
+from processing.motion.smoother import smooth
+from processing.motion.trajectory import rotation_matrices
 from recordings.errors import BadInput
 
 CUBE_M = 0.05 * CORNERS

@@ -13,7 +13,7 @@ import pytest
 from processing.field.fuse import FuseConfig, fuse
 from processing.field.learn import LearnConfig, TossViews, chosen_views
 from processing.field.mesh import grid_mesh
-from recordings.results import RobotMasks
+from recordings.results.folder import RobotMasks
 from recordings.tracks import ObjectTrack, Status
 
 

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from processing.given_masks import chosen_masks
-from processing.segment.background import BackgroundSegmenter
-from processing.segment.follow import BackgroundSettings
-from processing.segment.moving_camera import refuse_moving_camera
-from processing.segment.static_scene import StaticScene, exposure_gain
+from processing.segment.background.follow import BackgroundSettings
+from processing.segment.background.moving_camera import refuse_moving_camera
+from processing.segment.background.segmenter import BackgroundSegmenter
+from processing.segment.background.static_scene import StaticScene, exposure_gain
 from recordings.errors import BadInput
 from recordings.progress import Silent
 from recordings.records import RgbdFrame

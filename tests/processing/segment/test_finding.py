@@ -12,19 +12,26 @@ import pytest
 
 from processing.cli import main
 from processing.config import Config
-from processing.lost_tosses import without_lost
 from processing.pipeline import start_run
-from processing.segment.background import BackgroundSegmenter
-from processing.segment.candidates import Candidate, CandidateSettings, Finder
-from processing.segment.courses import CourseSettings, Look, choose, free_fall, join
-from processing.segment.follow import BackgroundSettings
-from processing.segment.sighting import FindSettings, courses_of, positions, read_sighting, sightings, write_sightings
-from processing.segment.static_scene import SceneSettings, StaticScene, learn_scene
-from processing.stage import Done
+from processing.segment.background.follow import BackgroundSettings
+from processing.segment.background.segmenter import BackgroundSegmenter
+from processing.segment.background.static_scene import SceneSettings, StaticScene, learn_scene
+from processing.segment.detect.candidates import Candidate, CandidateSettings, Finder
+from processing.segment.detect.detection import (
+    FindSettings,
+    courses_of,
+    positions,
+    read_sighting,
+    sightings,
+    write_sightings,
+)
+from processing.segment.detect.tracklets import CourseSettings, Look, choose, free_fall, join
+from processing.stages.lost_tosses import without_lost
+from processing.store import Done
 from recordings.errors import BadInput
 from recordings.progress import Silent
 from recordings.records import RgbdFrame
-from recordings.results import Results
+from recordings.results.folder import Results
 from recordings.session import Session
 
 DOWN = np.array([0.0, 0.6, 0.8])

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from processing.segment.follow import BackgroundSettings, Found, _is_all_object, follow, remember
-from processing.segment.foreground import ForegroundSettings
-from processing.segment.late_depth import LateDepthSettings, at_color_time, way_px
-from processing.segment.static_scene import StaticScene
+from processing.segment.background.follow import BackgroundSettings, Found, _is_all_object, follow, remember
+from processing.segment.background.foreground import ForegroundSettings
+from processing.segment.background.late_depth import LateDepthSettings, at_color_time, way_px
+from processing.segment.background.static_scene import StaticScene
 from recordings.records import RgbdFrame
 
 H, W = 120, 160

@@ -11,23 +11,23 @@ import numpy as np
 import pytest
 
 from processing.config import Config
-from processing.masks import object_masks, scene_notes, static_scene
 from processing.pipeline import Run, start_run
-from processing.segment.background import BackgroundSegmenter
-from processing.segment.follow import BackgroundSettings
-from processing.segment.moving_camera import why_other_scene
-from processing.segment.static_scene import (
+from processing.segment.background.follow import BackgroundSettings
+from processing.segment.background.moving_camera import why_other_scene
+from processing.segment.background.segmenter import BackgroundSegmenter
+from processing.segment.background.static_scene import (
     SceneSettings,
     StaticScene,
     calibrated_table_depth,
     learn_scene,
     seen_table_depth,
 )
+from processing.stages.masks import object_masks, scene_notes, static_scene
 from recordings.errors import DamagedFile
 from recordings.geometry import rotation_exp
 from recordings.progress import Silent
 from recordings.records import RgbdFrame
-from recordings.results import read_masks
+from recordings.results.folder import read_masks
 from recordings.session import Session
 
 Record = Callable[..., Path]

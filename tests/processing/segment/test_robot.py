@@ -13,20 +13,20 @@ import cv2
 import numpy as np
 import pytest
 
-from processing.frames import with_depth_scale
-from processing.masks import object_masks, static_scene
 from processing.pipeline import start_run
-from processing.rig import Rig, RobotOfSession, rig_stage
-from processing.segment.depth_scale import DepthScaleSettings, believed, corrected_depth, table_scale
-from processing.segment.robot_fit import RobotFitSettings, Sight, choose_sights, edge_offsets, fit_robot
-from processing.segment.robot_frames import RobotFrames, RobotSettings, with_robot
-from processing.segment.robot_view import RobotView
-from processing.segment.static_scene import StaticScene, calibrated_table_depth
-from recordings.collada import read_collada
+from processing.segment.background.depth_scale import DepthScaleSettings, believed, corrected_depth, table_scale
+from processing.segment.background.static_scene import StaticScene, calibrated_table_depth
+from processing.segment.robot.fit import RobotFitSettings, Sight, choose_sights, edge_offsets, fit_robot
+from processing.segment.robot.frames import RobotFrames, RobotSettings, with_robot
+from processing.segment.robot.render import RobotView
+from processing.sensor.frames import with_depth_scale
+from processing.stages.masks import object_masks, static_scene
+from processing.stages.rig import Rig, RobotOfSession, rig_stage
 from recordings.geometry import CameraModel, Transform, rotation_exp, rotation_log
 from recordings.progress import Silent
 from recordings.records import ArmStates, RgbdFrame
-from recordings.robot import PANDA_TOOL, ArmPath, panda
+from recordings.robot.arm import PANDA_TOOL, ArmPath, panda
+from recordings.robot.collada import read_collada
 from recordings.session import RgbdFrames, Session
 from recordings.tracks import RigCalibration
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import torch
 
-from processing.segment.xmem import Frame, Pass, XMemSegmenter, XMemSettings, confidence
-from processing.segment.xmem_memory import (
+from processing.segment.xmem.checkpoint import load_network, published_layers
+from processing.segment.xmem.memory import (
     Elements,
     Memory,
     MemorySettings,
@@ -20,8 +20,8 @@ from processing.segment.xmem_memory import (
     top_softmax,
     without_least_used,
 )
-from processing.segment.xmem_network import Widths, XMemNetwork
-from processing.segment.xmem_weights import load_network, published_layers
+from processing.segment.xmem.network import Widths, XMemNetwork
+from processing.segment.xmem.segmenter import Frame, Pass, XMemSegmenter, XMemSettings, confidence
 from recordings.errors import BadInput
 
 SMALL = Widths(base=8, key=8, value=16, hidden=8, deep=32, shallow=16)

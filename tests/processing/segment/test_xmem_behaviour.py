@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 import torch
 
-from processing.segment.background import BackgroundSegmenter, BackgroundSettings
+from processing.segment.background.segmenter import BackgroundSegmenter, BackgroundSettings
+from processing.segment.background.static_scene import SceneSettings, learn_scene
 from processing.segment.segmenter import Example, FrameMask, Segmenter
-from processing.segment.static_scene import SceneSettings, learn_scene
-from processing.segment.xmem import XMemSegmenter, XMemSettings
-from processing.segment.xmem_memory import MemorySettings
-from processing.segment.xmem_network import Widths, XMemNetwork
+from processing.segment.xmem.memory import MemorySettings
+from processing.segment.xmem.network import Widths, XMemNetwork
+from processing.segment.xmem.segmenter import XMemSegmenter, XMemSettings
 from recordings.errors import BadInput
 from recordings.progress import Silent
 from recordings.records import RgbdFrame

@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 import pytest
 
-from processing.metrics import align_first, frame_errors
+from processing.evaluate.metrics import align_first, frame_errors
 from processing.track.flags import FlagConfig, doubt
-from processing.track.sequence import TossTrack, track_toss
+from processing.track.track_toss import TossTrack, track_toss
 from recordings.errors import BadInput
 from recordings.geometry import Transform, rotation_exp
 from recordings.records import RgbdFrame

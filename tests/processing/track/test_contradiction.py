@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 from numpy import ndarray as Array
 
+from processing.features.sift import Sift
+from processing.sensor.rectification import Optics
+from processing.sensor.view import ViewConfig, ViewStore
 from processing.track import kernels as k
-from processing.track.contradiction import ContradictionConfig, Contradictions, Opposed, Rims
-from processing.track.contradiction import _against as against
-from processing.track.features import Sift
-from processing.track.footing import Footing, FootingConfig
 from processing.track.keyframes import view_directions
 from processing.track.known_shape import ShapeConfig, shape_views
-from processing.track.optics import Optics
-from processing.track.pool import Pool, far_apart, sides
-from processing.track.propose import Fit, distinct
-from processing.track.register import RegisterConfig, _placed, _Placing
-from processing.track.views import ViewConfig, ViewStore
+from processing.track.registration.consistency import ContradictionConfig, Contradictions, Opposed, Rims
+from processing.track.registration.consistency import _against as against
+from processing.track.registration.keyframe_database import Pool, far_apart, sides
+from processing.track.registration.proposals import Fit, distinct
+from processing.track.registration.register import RegisterConfig, _placed, _Placing
+from processing.track.registration.support_plane import Footing, FootingConfig
 from recordings.geometry import CameraModel, rotation_exp
 from recordings.progress import Silent
 from recordings.tracks import ObjectShape

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from numpy import ndarray as Array
 
+from processing.sensor.view import ViewStore
 from processing.track import kernels as k
-from processing.track.footing import Footing, FootingConfig, footing
-from processing.track.views import ViewStore
+from processing.track.registration.support_plane import Footing, FootingConfig, footing
 from recordings.geometry import rotation_exp
 
 HALF = 0.05

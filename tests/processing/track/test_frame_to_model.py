@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from processing.metrics import align_first, frame_errors
-from processing.track.frame_to_model import FrameToModel, Tracked
+from processing.baselines.frame_to_model import FrameToModel, Tracked
+from processing.evaluate.metrics import align_first, frame_errors
 from recordings.errors import BadInput
 from recordings.geometry import CameraModel, rotation_angle_rad
 from recordings.progress import Silent
@@ -53,7 +53,7 @@ def test_the_object_frame_starts_parallel_to_the_camera_in_the_cloud(toss: Any, 
 def test_the_mesh_lies_on_the_true_surface(toss: Any, tracked: Tracked) -> None:
     import trimesh
 
-    from processing.metrics import distance_to_surface_m
+    from processing.evaluate.metrics import distance_to_surface_m
 
     shift = np.linalg.inv(tracked.track.camera_from_object[0]) @ toss[2][0]
     inverse = np.linalg.inv(shift)
@@ -72,7 +72,7 @@ def test_covariances_are_positive_and_of_a_likely_size(tracked: Tracked) -> None
 
 def test_the_direction_along_a_plane_is_the_uncertain_one(tiny_world: Any) -> None:
     """Seen from above, a flat plate slides freely in its plane: only its distance is known."""
-    from processing.track.frame_to_model import covariance_of
+    from processing.baselines.frame_to_model import covariance_of
 
     rng = np.random.default_rng(0)
     points = np.c_[rng.uniform(-0.05, 0.05, (400, 2)), np.full(400, 0.8)]

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from processing.metrics import frame_errors
+from processing.evaluate.metrics import frame_errors
 from processing.track.known_shape import ShapeConfig
-from processing.track.register import register_tosses
-from processing.track.sequence import TossTrack, TrackConfig, track_toss
+from processing.track.registration.register import register_tosses
+from processing.track.track_toss import TossTrack, TrackConfig, track_toss
 from recordings.errors import BadInput
 from recordings.geometry import Transform
 from recordings.records import RgbdFrame

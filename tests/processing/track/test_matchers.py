@@ -11,16 +11,16 @@ import numpy as np
 import pytest
 import torch
 
+from processing.features.learned import PictureConfig, picture_of
+from processing.features.lightglue import LightGlue, LightGlueConfig, empty_network, root_sift
+from processing.features.loftr import Grid, Loftr, LoftrConfig
+from processing.features.sift import FeatureMatcher, Features, RansacConfig, Sift, relative_motions
+from processing.features.xfeat import XFeat, XFeatConfig
+from processing.sensor.rectification import Optics
+from processing.sensor.view import ViewConfig, ViewStore, cut
 from processing.track.beam import Candidate
-from processing.track.features import FeatureMatcher, Features, RansacConfig, Sift, relative_motions
-from processing.track.matchers import PictureConfig, picture_of
-from processing.track.matchers_lightglue import LightGlue, LightGlueConfig, empty_network, root_sift
-from processing.track.matchers_loftr import Grid, Loftr, LoftrConfig
-from processing.track.matchers_xfeat import XFeat, XFeatConfig
 from processing.track.notes import NotesConfig, notes_of
-from processing.track.optics import Optics
-from processing.track.sequence import TossTrack
-from processing.track.views import ViewConfig, ViewStore, cut
+from processing.track.track_toss import TossTrack
 from recordings.errors import BadInput
 from recordings.geometry import CameraModel, rotation_exp
 from recordings.records import RgbdFrame

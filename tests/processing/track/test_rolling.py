@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from numpy import ndarray as Array
 
+from processing.features.sift import Sift
+from processing.sensor.view import ViewStore
 from processing.track.beam import Scene
-from processing.track.features import Sift
-from processing.track.rolling import Grounded, RollConfig, Told, rolled, sunk
-from processing.track.round_axis import Axis
-from processing.track.steady_turns import SteadyConfig, _carried
-from processing.track.views import ViewStore
+from processing.track.revolution.axis import Axis
+from processing.track.revolution.azimuth_smoothing import SteadyConfig, _carried
+from processing.track.revolution.rolling import Grounded, RollConfig, Told, rolled, sunk
 from recordings.geometry import rotation_exp, rotation_log
 
 RADIUS, HALF, STEP_S = 0.04, 0.05, 1 / 30

@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from processing.features.sift import Sift
+from processing.sensor.rectification import Optics
+from processing.sensor.view import Crop, ViewConfig, ViewStore
 from processing.track import kernels as k
 from processing.track.beam import Scene
-from processing.track.features import Sift
-from processing.track.optics import Optics
-from processing.track.round_axis import Axis
-from processing.track.round_body import BodyConfig, RoundBody, anchored, is_round
-from processing.track.turns import TurnConfig, given_turns
-from processing.track.views import Crop, ViewConfig, ViewStore
+from processing.track.revolution.axis import Axis
+from processing.track.revolution.azimuth import TurnConfig, given_turns
+from processing.track.revolution.profile import BodyConfig, RoundBody, anchored, is_round
 from recordings.geometry import CameraModel, rotation_exp
 
 CAMERA = CameraModel("d455", 640, 480, np.array([[386.0, 0, 320], [0, 386, 240], [0, 0, 1]]))

@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from processing.features.sift import Sift
+from processing.motion.motion_prior import carried_on
+from processing.track.appearance_ratio import EvidenceConfig, evidence
 from processing.track.beam import Scene
-from processing.track.evidence import EvidenceConfig, evidence
-from processing.track.features import Sift
-from processing.track.graph import GraphConfig, choose_pairs
-from processing.track.motion import carried_on
-from processing.track.sequence import TrackConfig, views_of
+from processing.track.joint_refinement import GraphConfig, choose_pairs
+from processing.track.track_toss import TrackConfig, views_of
 from recordings.geometry import rotation_exp
 from recordings.progress import Silent
 

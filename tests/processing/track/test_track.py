@@ -11,21 +11,21 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from processing.metrics import align_first, frame_errors
+from processing.evaluate.metrics import align_first, frame_errors
+from processing.features.sift import rigid_fit
+from processing.motion.motion_prior import MotionConfig, all_turns, change_cost, moved, steady_spin, turn_between
+from processing.sensor.rectification import Optics
+from processing.sensor.view import ViewConfig, ViewStore, cut, make_view
+from processing.track import hypotheses as story
 from processing.track import kernels as k
-from processing.track import story
-from processing.track.features import rigid_fit
+from processing.track.center_of_mass import flight_center
 from processing.track.flags import camera_covariance
-from processing.track.graph import GraphConfig, Motion, _add_motion, refine
+from processing.track.joint_refinement import GraphConfig, Motion, _add_motion, refine
 from processing.track.keyframes import KeyframeConfig, references
-from processing.track.middle import flight_center
-from processing.track.motion import MotionConfig, all_turns, change_cost, moved, steady_spin, turn_between
-from processing.track.multi_hypothesis import read_toss_track, write_toss_track
-from processing.track.optics import Optics
-from processing.track.register import register_tosses
-from processing.track.round_axis import Axis
-from processing.track.sequence import TossTrack, TrackConfig, track_toss
-from processing.track.views import ViewConfig, ViewStore, cut, make_view
+from processing.track.registration.register import register_tosses
+from processing.track.revolution.axis import Axis
+from processing.track.track_file import read_toss_track, write_toss_track
+from processing.track.track_toss import TossTrack, TrackConfig, track_toss
 from recordings.errors import BadInput
 from recordings.geometry import CameraModel, Transform, rotation_exp
 from recordings.records import RgbdFrame

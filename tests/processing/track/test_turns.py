@@ -7,17 +7,26 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from processing.features.sift import Sift
+from processing.sensor.rectification import Optics
+from processing.sensor.view import Crop, ViewConfig, ViewStore
 from processing.track import kernels as k
-from processing.track import turn_kernels as tk
 from processing.track.beam import Scene
-from processing.track.charts import ChartConfig, Charts, _heights, _off, _Pixels, _shines
-from processing.track.features import Sift
-from processing.track.optics import Optics
-from processing.track.rolling import Told
-from processing.track.round_axis import Axis, AxisConfig, open_axis
-from processing.track.steady_turns import Pace, SteadyConfig, steadied
-from processing.track.turns import TurnConfig, Turned, _believed, _Frames, _stood, _usual, doubted, turns_of_standing
-from processing.track.views import Crop, ViewConfig, ViewStore
+from processing.track.revolution import azimuth_kernels as tk
+from processing.track.revolution.axis import Axis, AxisConfig, open_axis
+from processing.track.revolution.azimuth import (
+    TurnConfig,
+    Turned,
+    _believed,
+    _Frames,
+    _stood,
+    _usual,
+    doubted,
+    turns_of_standing,
+)
+from processing.track.revolution.azimuth_smoothing import Pace, SteadyConfig, steadied
+from processing.track.revolution.rolling import Told
+from processing.track.revolution.unwrapping import ChartConfig, Charts, _heights, _off, _Pixels, _shines
 from recordings.geometry import CameraModel, rotation_exp
 
 CAMERA = CameraModel("d455", 640, 480, np.array([[386.0, 0, 320], [0, 386, 240], [0, 0, 1]]))

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from recordings.geometry import rotation_exp
-from recordings.results import TossRecord, VariantRecord, write_masks, write_shape, write_track, write_variant
+from recordings.results.folder import TossRecord, VariantRecord, write_masks, write_shape, write_track, write_variant
 from recordings.session import Session
 from recordings.tracks import ObjectShape, ObjectTrack
 

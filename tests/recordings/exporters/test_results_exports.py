@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from recordings.errors import BadInput, WriteFailed
 from recordings.exporters.export import EXPORTERS, export
-from recordings.results import Results, read_masks
+from recordings.results.folder import Results, read_masks
 from recordings.session import Session
 
 

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from recordings.codec import decode_image
 from recordings.exporters.export import export
 from recordings.exporters.folder import seconds
 from recordings.exporters.lerobot import arm_at, grid
 from recordings.importers.folder import import_folder
+from recordings.mcap.codec import decode_image
 from recordings.records import ArmStates
 from recordings.session import Session, Toss
 

@@ -10,17 +10,17 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from recordings import film_file
 from recordings.cli_session import main
 from recordings.errors import BadInput
 from recordings.exporters.export import export
 from recordings.exporters.video import SLOWED
-from recordings.film import STATUS_RGB, Film
-from recordings.film_file import durations_ms, looping_webp, write_gif, write_mp4
-from recordings.film_scene import Stage
+from recordings.film import file as film_file
+from recordings.film.file import durations_ms, looping_webp, write_gif, write_mp4
+from recordings.film.film import STATUS_RGB, Film
+from recordings.film.raster import covered_pixels
+from recordings.film.scene import Stage
 from recordings.geometry import Transform
-from recordings.raster import covered_pixels
-from recordings.results import Results, write_track
+from recordings.results.folder import Results, write_track
 from recordings.session import Session
 from recordings.tracks import ObjectShape, ObjectTrack
 
@@ -149,7 +149,7 @@ def test_a_square_covers_the_pixels_that_its_corners_say(film):
 
 
 def test_the_nearer_of_two_surfaces_is_seen_whichever_is_drawn_first(film):
-    from recordings.raster import Canvas
+    from recordings.film.raster import Canvas
 
     model = film._calibration.camera("d455")
     corners = np.array([[x, y, 0.0] for x in (-0.2, 0.2) for y in (-0.2, 0.2)])

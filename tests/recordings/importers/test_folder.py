@@ -12,10 +12,10 @@ import cv2
 import numpy as np
 import pytest
 
-from recordings.codec import decode_image
 from recordings.errors import BadInput, TosslabError, WriteFailed
 from recordings.exporters.folder import export_folder
 from recordings.importers.folder import import_folder
+from recordings.mcap.codec import decode_image
 from recordings.session import Session, Toss
 
 

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from recordings.codec import decode_image
 from recordings.errors import BadInput
 from recordings.importers.lens import fit_brown_conrady
 from recordings.importers.realsense import import_realsense
+from recordings.mcap.codec import decode_image
 from recordings.session import Session
 
 rs = pytest.importorskip("pyrealsense2")

@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 import pytest
 
-from recordings.codec import decode_image
 from recordings.errors import BadInput
 from recordings.importers.rosbag import import_rosbag
+from recordings.mcap.codec import decode_image
 from recordings.session import Session
 
 rosbags = pytest.importorskip("rosbags")

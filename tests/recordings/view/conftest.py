@@ -18,10 +18,10 @@ from recordings.records import (
     StampedPose,
     TossEvent,
 )
-from recordings.results import TossRecord, VariantRecord, write_shape, write_track, write_variant
+from recordings.results.folder import TossRecord, VariantRecord, write_shape, write_track, write_variant
 from recordings.session_writer import SessionWriter, write_truth
 from recordings.tracks import ObjectShape, ObjectTrack, RigCalibration, TagPlacement
-from recordings.view import save_rrd
+from recordings.view.draw import save_rrd
 
 FRAMES, STEP_NS, TOSS_NS = 6, 33_000_000, 2_000_000_000
 DEPTH_LATER_NS = 5_000_000

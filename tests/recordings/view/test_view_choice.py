@@ -9,10 +9,10 @@ import pytest
 from recordings.errors import BadInput
 from recordings.records import DepthImage, StampedPose
 from recordings.session_writer import SessionWriter
-from recordings.view import Choice, is_foreign, open_scene, save_rrd
-from recordings.view_layers import Look
-from recordings.view_scene import half_way_down_ns, lay_out, moment_ns
-from recordings.view_viewer import run_rerun
+from recordings.view.draw import Choice, is_foreign, open_scene, save_rrd
+from recordings.view.layers import Look
+from recordings.view.scene import half_way_down_ns, lay_out, moment_ns
+from recordings.view.viewer import run_rerun
 
 
 def test_a_large_image_is_thinned_to_the_number_of_points_asked_for(tiny, session, tmp_path):

@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from recordings.cycle_steps import read_cycle
 from recordings.errors import DamagedFile
-from recordings.results import Results, TossRecord, VariantRecord, write_shape, write_track, write_variant
+from recordings.results.folder import Results, TossRecord, VariantRecord, write_shape, write_track, write_variant
 from recordings.tracks import ObjectShape, ObjectTrack
-from recordings.view import open_scene, save_rrd
-from recordings.view_blueprint import about_text, blueprint
-from recordings.view_cycle import gap_colors, gap_m
+from recordings.view.blueprint import about_text, blueprint
+from recordings.view.cycle import gap_colors, gap_m
+from recordings.view.cycle_steps import read_cycle
+from recordings.view.draw import open_scene, save_rrd
 
 NAME, REJECTED = "ours_all", 4
 FIRST, VISION, LEARNED, DRAWN, TRACK, SHAPE, JUDGE, JUDGE_2 = (

@@ -5,7 +5,7 @@ import trimesh
 
 from recordings.geometry import CameraModel, Transform
 from recordings.tracks import ObjectShape
-from recordings.view_mesh import outline_px, vertex_normals
+from recordings.view.mesh import outline_px, vertex_normals
 
 PLAIN = CameraModel("c", 640, 480, np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]]))
 

@@ -7,8 +7,8 @@ import pytest
 from rerun.chunk import RrdReader
 
 from recordings.geometry import CameraModel
-from recordings.robot import panda
-from recordings.view_viewer import rerun_program
+from recordings.robot.arm import panda
+from recordings.view.viewer import rerun_program
 
 
 def test_the_file_passes_reruns_own_verification(rrd):

@@ -8,11 +8,11 @@ import cv2
 import numpy as np
 import pytest
 
-from recordings.results import Results, TossRecord, write_masks, write_variant
-from recordings.track_notes import Matches, Rejected, write_notes
-from recordings.view import Choice, open_scene, save_rrd
-from recordings.view_blueprint import about_text, blueprint
-from recordings.view_track import mask_png, spanned
+from recordings.results.folder import Results, TossRecord, write_masks, write_variant
+from recordings.results.track_notes import Matches, Rejected, write_notes
+from recordings.view.blueprint import about_text, blueprint
+from recordings.view.draw import Choice, open_scene, save_rrd
+from recordings.view.track import mask_png, spanned
 
 IMAGE, NAME = "/world/cameras/d455/image", "ours_all"
 

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from recordings.cli_view import main
-from recordings.film import STATUS_RGB
-from recordings.view import open_scene, save_rrd, screenshot, stream
-from recordings.view_layers import TIME
-from recordings.view_viewer import LOOPBACK, Viewer, ViewerFailed
+from recordings.film.film import STATUS_RGB
+from recordings.view.draw import open_scene, save_rrd, screenshot, stream
+from recordings.view.layers import TIME
+from recordings.view.viewer import LOOPBACK, Viewer, ViewerFailed
 
 
 @pytest.fixture(scope="session")

@@ -1,0 +1,110 @@
+"""One lens fitted to views of a board, and what it leaves of views kept aside."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray as Array
+
+from calibration.cameras.bundle import Observations, Scene, Solved, adjust
+from calibration.cameras.extrinsics import bad_views, board_pose, whitening
+from calibration.cameras.targets import TargetView, numbered_marks
+from recordings.errors import BadInput
+from recordings.geometry import CameraModel
+
+LEAST_VIEWS = 5
+FOLDS = 4
+CHANCE = 2.0
+"""A difference on views kept aside is more than chance from as many standard errors on."""
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """A lens fitted to views. `aside_px2`: by the number of each view, the mean square of what a lens fitted without it
+    left of a coordinate there, the board's pose found anew."""
+
+    solved: Solved
+    seen: Observations
+    rejected: tuple[int, ...]
+    aside_px2: Mapping[int, float]
+    hold_out_px: float
+
+    @property
+    def model(self) -> CameraModel:
+        return self.solved.scene.models[0]
+
+    @staticmethod
+    def of(start: CameraModel, views: Sequence[TargetView]) -> Fit:
+        """All views, then without those that do not fit; and each quarter of them kept aside once."""
+        solved, seen = solve_lens(start, views, range(len(views)))
+        rejected = tuple(v for _, v in bad_views(solved, seen))
+        numbers = [v for v in range(len(views)) if v not in rejected]
+        if rejected and len(numbers) >= LEAST_VIEWS:
+            solved, seen = solve_lens(start, views, numbers)
+        else:
+            rejected, numbers = (), list(range(len(views)))
+        squares: dict[int, Float[Array, "n 2"]] = {}
+        for fold in range(FOLDS):
+            aside = numbers[fold::FOLDS]
+            rest, _ = solve_lens(solved.scene.models[0], views, [v for v in numbers if v not in aside])
+            squares |= squares_aside(rest.scene.models[0], views, aside)
+        hold_out = float(np.sqrt(np.concatenate([*squares.values()]).mean()))
+        return Fit(solved, seen, rejected, {v: float(q.mean()) for v, q in squares.items()}, hold_out)
+
+
+def squares_aside(
+    model: CameraModel, views: Sequence[TargetView], numbers: Sequence[int]
+) -> dict[int, Float[Array, "n 2"]]:
+    """What a lens leaves of views, squared, by their number: the board's poses alone are found, on its stated
+    layout."""
+    solved, seen = solve_lens(model, views, numbers, free_lens=False)
+    return {v: solved.residual_px[seen.view == v] ** 2 for v in np.unique(seen.view).tolist()}
+
+
+def gain_by_chance(one: Mapping[int, float], other: Mapping[int, float]) -> float:
+    """By how many standard errors `one` leaves less than `other` of the views that both were kept from (paired; each
+    difference in units of what the two leave there, so that no single view decides)."""
+    shared = sorted(set(one) & set(other))
+    a, b = (np.array([each[v] for v in shared]) for each in (one, other))
+    if len(shared) < 2 or np.array_equal(a, b):
+        return 0.0
+    gain = (b - a) / (a + b)
+    return float(gain.mean() / (gain.std(ddof=1) / np.sqrt(len(gain))))
+
+
+def solve_lens(
+    start: CameraModel,
+    views: Sequence[TargetView],
+    numbers: Sequence[int],
+    free_lens: bool = True,
+    print_m: float | None = None,
+) -> tuple[Solved, Observations]:
+    """Lens (where free) and board poses from the views of these numbers; with `print_m`, the standard deviation of
+    where the board's marks lie, also their places."""
+    poses, chosen = np.tile(np.eye(4), (len(views), 1, 1)), []
+    for v in numbers:
+        found = board_pose(start, views[v])
+        if found:
+            poses[v] = found[0]
+            chosen.append(v)
+    if not chosen:
+        raise BadInput(f"no pose of the board fits the views of {start.frame}; is its layout as stated?")
+    counts = [len(views[v]) for v in chosen]
+    marks, many = numbered_marks([(0, view) for view in views])
+    seen = Observations(
+        np.zeros(sum(counts), dtype=np.int64),
+        np.repeat(chosen, counts),
+        np.zeros(sum(counts), dtype=np.int64),
+        np.concatenate([views[v].points_m for v in chosen]),
+        np.concatenate([views[v].pixels for v in chosen]),
+        whitening(np.concatenate([views[v].covariance_px2 for v in chosen])),
+        np.concatenate([marks[v] for v in chosen]),
+    )
+    one, no = np.eye(4)[None], np.zeros(1, dtype=bool)
+    free_views, lens = np.isin(np.arange(len(views)), chosen), np.array([free_lens])
+    shift = np.zeros((many, 3))
+    scene = Scene((start,), one, poses, one, no, free_views, no, lens, np.ones(1), no, shift, print_m)
+    return adjust(scene, seen), seen

@@ -1,0 +1,81 @@
+"""How much too far the depth camera reports: its view of the table against where the calibration has the table.
+
+A depth that is too large by a factor moves a plane to a parallel one. So a tilt between the two planes is the
+calibration's own error, and tells how far its distance to the table may be off as well.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float32
+from numpy import ndarray as Array
+
+from processing.segment.background.static_scene import StaticScene, fit_plane
+from recordings.geometry import CameraModel, Transform
+
+
+@dataclass(frozen=True)
+class DepthScaleSettings:
+    """When a depth scale is believed."""
+
+    near_table_m: float = 0.03
+    """Scene points this near to the calibrated table plane may be the table."""
+    least_share: float = 0.05
+    """With a smaller share of the image the table is hardly in view."""
+    tolerance_m: float = 0.008
+    floor_m: float = 0.0008
+    """The calibrated distance to the table is never better known than this."""
+    tilt_weight: float = 1.5
+    """A tilt of the calibrated plane speaks for an error of its distance: so many times the tilt times the distance."""
+    sensor_sigma: float = 0.0005
+    """Standard deviation of the scale that averaging does not remove (lens, fixed pattern)."""
+    significant: float = 2.5
+    """A scale within so many standard deviations of 1 is taken as 1."""
+
+
+@dataclass(frozen=True)
+class TableScale:
+    """Reported / calibrated distance of the table, its standard deviation, and the planes' tilt against each other."""
+
+    scale: float
+    sigma: float
+    tilt_deg: float
+    pixels: int
+
+
+def table_scale(
+    scene: StaticScene, camera: CameraModel, world_from_camera: Transform, settings: DepthScaleSettings
+) -> TableScale | None:
+    """The depth scale that the table tells; None where the table is hardly seen."""
+    s = settings
+    near = (scene.table_depth_m > 0) & scene.known & (scene.depth_m > 0)
+    near &= np.abs(scene.depth_m - scene.table_depth_m) < s.near_table_m * np.maximum(1.0, scene.table_depth_m)
+    if near.mean() < s.least_share:
+        return None
+    points = (camera.pixel_rays()[near] * scene.depth_m[near][:, None]).astype(np.float64)
+    points = points[:: max(1, len(points) // 20_000)]
+    plane = fit_plane(points, s.tolerance_m)
+    if plane is None:
+        return None
+    up, height_m = world_from_camera.rotation[2], float(world_from_camera.translation_m[2])
+    normal = plane[0] if plane[0] @ up > 0 else -plane[0]
+    on_plane = points[np.abs(points @ normal - normal @ points.mean(0)) < 3 * s.tolerance_m]
+    center = on_plane.mean(0)
+    tilt_rad = float(np.arccos(np.clip(normal @ up, -1, 1)))
+    distance_m = float(np.linalg.norm(center))
+    sigma_m = np.hypot(s.floor_m, s.tilt_weight * tilt_rad * distance_m)
+    scale = float(-(up @ center) / height_m)
+    return TableScale(scale, float(np.hypot(sigma_m / height_m, s.sensor_sigma)), np.degrees(tilt_rad), int(near.sum()))
+
+
+def believed(scale: float, sigma: float, settings: DepthScaleSettings) -> float:
+    """The scale to correct depth by: 1 where it is not significantly another."""
+    significant = np.isfinite(sigma) and abs(scale - 1) > settings.significant * sigma
+    return scale if significant else 1.0
+
+
+def corrected_depth(depth_m: Float32[Array, "h w"], scale: float) -> Float32[Array, "h w"]:
+    """True depth of what a camera with this scale reports; 0 stays 0."""
+    return depth_m if scale == 1.0 else (depth_m / np.float32(scale)).astype(np.float32)

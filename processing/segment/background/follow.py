@@ -1,0 +1,303 @@
+"""One step of the background segmenter: where the object is in the next frame, from what is known of the last ones."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Float32
+from numpy import ndarray as Array
+
+from processing.segment.background.color_model import Likeness
+from processing.segment.background.foreground import (
+    ForegroundSettings,
+    evidence,
+    fill_holes,
+    grown,
+    moved_pixels,
+    nearer_than_scene,
+    refine_border,
+    smooth,
+    window_around,
+)
+from processing.segment.background.late_depth import LateDepthSettings, at_color_time, way_px
+from processing.segment.background.static_scene import StaticScene
+from recordings.records import RgbdFrame
+
+
+@dataclass(frozen=True)
+class BackgroundSettings:
+    """How masks are followed from frame to frame."""
+
+    foreground: ForegroundSettings = field(default_factory=ForegroundSettings)
+    late: LateDepthSettings = field(default_factory=LateDepthSettings)
+    least_px: int = 120
+    """A smaller thing is not the object."""
+    grown: float = 1.4
+    """A component larger than the expected mask by this factor holds something else as well."""
+    turned: float = 0.6
+    turned_m: float = 0.15
+    """What has grown on the object is its own within this share of its size, and this much in depth."""
+    depth_margin_m: float = 0.04
+    """The object's depth in a frame exceeds the last frame's range by no more than this, when others touch it."""
+    sure: float = 0.7
+    """Colours are learned from masks that are more confident than this."""
+    piece_px: int = 25
+    """A smaller piece behind a finger is not looked for."""
+    piece_reach_px: int = 8
+    """How far outside of the object's hull such a piece may lie."""
+    darkest: float = 0.12
+    """A frame this much darker than the scene, or brighter by the inverse, is followed by depth alone."""
+    most_clipped: float = 0.5
+    """So is a frame in which a larger share of the scene is overexposed."""
+    least_gain: float = 0.02
+    """A smaller change of brightness is not evened out."""
+    table_share: float = 0.8
+    """A given mask of which so much lies in the table's plane shows the table."""
+    other_share: float = 0.3
+    """Another thing that moves and is larger than this share of the object is counted."""
+    part_of_scene: float = 0.9
+    """An object less of which stands out from the scene than this was partly learned as scene."""
+    unknown: float = 0.02
+    """A component with a larger share of pixels whose scene is unknown is told by its own colours."""
+
+
+@dataclass(frozen=True, eq=False)
+class Memory:
+    """What is known when the next frame comes."""
+
+    mask: Bool[Array, "h w"]
+    velocity_px: Float[Array, "2"]
+    depth_range_m: tuple[float, float]
+    likeness: Likeness
+    missed: int = 0
+    others_near: bool = False
+    """Something else that is not scene was near the object in the last frame: a hand, a stick."""
+    time_ns: int = 0
+    speed_px_s: Float[Array, "2"] = field(default_factory=lambda: np.zeros(2))
+    """Colour's time when the object was last found, and how fast it then moved in the image."""
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """The object in one frame. `others_px`: pixels near it that are neither scene nor robot nor the object."""
+
+    mask: Bool[Array, "h w"]
+    confidence: float
+    others_px: int = 0
+    others_near: bool = False
+    largest_other_px: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class Beside:
+    """What the robot's drawing adds: log-odds of the object's colours against the robot's, and where the scene is
+    unknown though no robot stands there."""
+
+    odds: Float32[Array, "h w"]
+    unknown: Bool[Array, "h w"]
+
+
+def remember(memory: Memory | None, frame: RgbdFrame, found: Found, learn: bool = True) -> Memory:
+    """Memory after a frame. An empty mask leaves everything but the count of misses; colours are learned on request."""
+    mask = found.mask
+    if memory is not None and not mask.any():
+        return replace(memory, missed=memory.missed + 1)
+    depth = frame.depth_m[mask & (frame.depth_m > 0)]
+    low, high = (float(d) for d in np.quantile(depth, (0.02, 0.98))) if len(depth) > 10 else (0.0, 20.0)
+    if memory is None:
+        return Memory(mask, np.zeros(2), (low, high), Likeness.of(frame.color_rgb, mask), time_ns=frame.time_ns)
+    way = _center(mask) - _center(memory.mask)
+    likeness = memory.likeness.learned(frame.color_rgb, mask) if learn else memory.likeness
+    speed = way / ((frame.time_ns - memory.time_ns) * 1e-9) if frame.time_ns != memory.time_ns else np.zeros(2)
+    return Memory(
+        mask,
+        way / (memory.missed + 1),
+        (low, high),
+        likeness,
+        others_near=found.others_near,
+        time_ns=frame.time_ns,
+        speed_px_s=speed,
+    )
+
+
+def _center(mask: Bool[Array, "h w"]) -> Float[Array, "2"]:
+    """Centroid (x, y) in pixels."""
+    moments = cv2.moments(mask.astype(np.uint8), binaryImage=True)
+    return np.array([moments["m10"], moments["m01"]]) / max(moments["m00"], 1.0)
+
+
+def reach_px(area_px: int, steps: int) -> int:
+    """How far around the expected mask the object is sought, or something that may touch it, after so many frames."""
+    return int(0.6 * np.sqrt(area_px)) * steps + 4
+
+
+def follow(
+    frame: RgbdFrame,
+    scene: StaticScene,
+    memory: Memory,
+    block: Bool[Array, "h w"] | None,
+    beside: Beside | None,
+    s: BackgroundSettings,
+) -> Found:
+    """The mask in the next frame; empty with confidence 0 where the object is not found."""
+    shift = memory.velocity_px * (memory.missed + 1)
+    expected = _shifted(memory.mask, shift)
+    area = int(memory.mask.sum())
+    reach = reach_px(area, memory.missed + 1)
+    near = grown(expected, min(reach, 150))
+    way = way_px(frame, memory.speed_px_s)
+    far_px = float(np.linalg.norm(way))
+    if far_px > s.late.least_px:
+        body = component_in(_moved_by_depth(frame, scene, block, s), _shifted(near, -way))
+        frame = at_color_time(frame, scene, body, way, s.late, s.foreground)
+        s = replace(s, foreground=s.late.at_border(s.foreground))
+    moved = moved_pixels(frame, scene, s.foreground)
+    if (moved & ~scene.known).any():
+        alike = memory.likeness.log_odds(frame.color_rgb) > 0
+        moved &= scene.known | nearer_than_scene(frame.depth_m, scene, s.foreground) | alike
+    if block is not None:
+        moved &= ~block
+    rough = component_in(moved, near)
+    if beside is not None:
+        rough |= _other_pieces(frame, moved & ~rough, expected, beside, memory, s)
+    others = moved & near & ~grown(rough, 3)
+    others_px = int(others.sum())
+    if rough.sum() < s.least_px:
+        return Found(np.zeros_like(rough), 0.0, others_px, False)
+    wide = grown(rough, 5)
+    unknown = ~scene.known if beside is None else beside.unknown
+    if not memory.others_near:  # where nothing else is near, depth before the table tells enough
+        unknown = unknown & (scene.depth_m == 0)
+    strange = (wide & unknown).sum() > s.unknown * rough.sum()
+    larger = rough.sum() > s.grown * area
+    if strange or (larger and not _is_all_object(frame, rough, expected, memory, far_px, s)):
+        rough = _among_others(frame, scene, moved, expected, memory, beside, s)
+        if rough.sum() < s.least_px:
+            return Found(np.zeros_like(rough), 0.0, others_px, True)
+        mask, sure = rough, 0.6
+    else:
+        least = None if beside is None else s.piece_px
+        bare = None if scene.known[wide].all() else np.where(scene.known, 0, memory.likeness.log_odds(frame.color_rgb))
+        # where the scene's colour is known, it tells; the robot's colours speak against the object only
+        odds = bare if beside is None else np.where(scene.known, np.minimum(beside.odds, 0), beside.odds)
+        mask, sure = refine_border(frame, scene, rough, odds, s.foreground, least)
+    if block is not None:
+        mask = mask & ~block
+    ratio = min(mask.sum(), area) / max(mask.sum(), area, 1)
+    solid = moved & near & (frame.depth_m > 0)  # what only looks different may be the object's shadow
+    others_near = int((solid & ~grown(mask, 3)).sum()) > s.least_px or int((solid & ~mask).sum()) > 3 * s.least_px
+    largest = _largest_other(moved & ~grown(mask, 9), s)
+    return Found(mask, float(np.clip(sure * min(1.0, ratio / 0.7), 0, 1)), others_px, others_near, largest)
+
+
+def _moved_by_depth(
+    frame: RgbdFrame, scene: StaticScene, block: Bool[Array, "h w"] | None, s: BackgroundSettings
+) -> Bool[Array, "h w"]:
+    nearer = nearer_than_scene(frame.depth_m, scene, s.foreground)
+    nearer = nearer if block is None else nearer & ~block
+    return cv2.morphologyEx(nearer.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)) > 0
+
+
+def _largest_other(moved: Bool[Array, "h w"], s: BackgroundSettings) -> int:
+    """Size of the largest thing, away from the object, that is not scene."""
+    _, _, stats, _ = cv2.connectedComponentsWithStats(moved.astype(np.uint8), connectivity=4)
+    return int(stats[1:, cv2.CC_STAT_AREA].max(initial=0))
+
+
+def _shifted(mask: Bool[Array, "h w"], by_px: Float[Array, "2"]) -> Bool[Array, "h w"]:
+    moved = np.array([[1, 0, by_px[0]], [0, 1, by_px[1]]], dtype=np.float32)
+    return cv2.warpAffine(mask.astype(np.uint8), moved, mask.shape[::-1], flags=cv2.INTER_NEAREST) > 0
+
+
+def component_in(mask: Bool[Array, "h w"], region: Bool[Array, "h w"]) -> Bool[Array, "h w"]:
+    """The component that has most pixels in a region."""
+    count, labels = cv2.connectedComponents(mask.astype(np.uint8), connectivity=4)
+    inside = np.bincount(labels[region], minlength=count)
+    inside[0] = 0
+    return labels == int(inside.argmax()) if inside.any() else np.zeros_like(mask)
+
+
+def _is_all_object(
+    frame: RgbdFrame,
+    rough: Bool[Array, "h w"],
+    expected: Bool[Array, "h w"],
+    memory: Memory,
+    way_px: float,
+    s: BackgroundSettings,
+) -> bool:
+    """Whether what has grown on the object is its own, as of a box that turns its broad side.
+
+    It does not reach far, in the image (more where it moves by `way_px` between the exposures, which an impact changes)
+    or in depth, and nothing else was near that could have touched it. Its colours say nothing: a box that spins shows a
+    side in this frame that it never showed before.
+    """
+    added = rough & ~expected
+    reach = cv2.distanceTransform((~expected).astype(np.uint8), cv2.DIST_L2, 3)[added]
+    if memory.others_near or np.quantile(reach, 0.95) > s.turned * np.sqrt(memory.mask.sum()) + way_px:
+        return False
+    low, high = memory.depth_range_m
+    depth = frame.depth_m[added & (frame.depth_m > 0)]
+    inside = (depth > low - s.turned_m) & (depth < high + s.turned_m)
+    return bool(len(depth) > 0 and inside.mean() > 0.9)
+
+
+def _other_pieces(
+    frame: RgbdFrame,
+    moved: Bool[Array, "h w"],
+    expected: Bool[Array, "h w"],
+    beside: Beside,
+    memory: Memory,
+    s: BackgroundSettings,
+) -> Bool[Array, "h w"]:
+    """What a finger has cut off the object: pieces of its colours and depth beside the robot, where it is expected."""
+    out = np.zeros_like(expected)
+    corners = cv2.findNonZero(expected.astype(np.uint8))
+    if corners is None:
+        return out
+    hull = cv2.fillConvexPoly(np.zeros(expected.shape, np.uint8), cv2.convexHull(corners), 1)
+    whole = grown(hull > 0, s.piece_reach_px)
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(moved.astype(np.uint8), connectivity=4)
+    low, high = memory.depth_range_m
+    for k in range(1, count):
+        if stats[k, cv2.CC_STAT_AREA] < s.piece_px:
+            continue
+        piece = np.asarray(labels == k)
+        depth = frame.depth_m[piece & (frame.depth_m > 0)]
+        inside = len(depth) > 0 and low - s.depth_margin_m < float(np.median(depth)) < high + s.depth_margin_m
+        close = beside.odds[piece] != 0
+        alike = close.any() and float(beside.odds[piece][close].mean()) > 0
+        if inside and alike and whole[piece].mean() > 0.6:
+            out |= piece
+    return out
+
+
+def _among_others(
+    frame: RgbdFrame,
+    scene: StaticScene,
+    moved: Bool[Array, "h w"],
+    expected: Bool[Array, "h w"],
+    memory: Memory,
+    beside: Beside | None,
+    s: BackgroundSettings,
+) -> Bool[Array, "h w"]:
+    """The object among other things that are not scene either: by its colours, its depth and where it is expected."""
+    at = window_around(expected, 30)
+    if at is None:
+        return np.zeros_like(expected)
+    not_scene = np.minimum(evidence(frame, scene, expected, at, None, s.foreground), 1.0)
+    inward = cv2.distanceTransform(expected[at].astype(np.uint8), cv2.DIST_L2, 3)
+    outward = cv2.distanceTransform((~expected[at]).astype(np.uint8), cv2.DIST_L2, 3)
+    place = np.clip((inward - outward) / 5.0, -3.0, 1.5)
+    depth, (low, high) = frame.depth_m[at], memory.depth_range_m
+    elsewhere = (depth > 0) & ((depth < low - s.depth_margin_m) | (depth > high + s.depth_margin_m))
+    likeness = memory.likeness.log_odds(frame.color_rgb[at], crowded=True)
+    if beside is not None:
+        likeness = np.minimum(likeness, np.where(beside.odds[at] != 0, beside.odds[at], likeness))
+    odds = not_scene + s.foreground.weight_likeness * likeness + place - 4.0 * elsewhere
+    odds = np.where(moved[at], odds, np.minimum(odds, -1.0)).astype(np.float32)
+    belief = smooth(odds, frame.color_rgb[at].astype(np.float32), s.foreground)
+    out = np.zeros_like(expected)
+    out[at] = cv2.morphologyEx((belief > 0).astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)) > 0
+    return fill_holes(component_in(out, expected))

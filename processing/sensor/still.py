@@ -1,0 +1,268 @@
+"""Waiting costs nothing: frames in which nothing moves are recognised, and few of them are worked on.
+
+A take that goes on while the object lies still shows the same image again and again. Such a stretch keeps a few frames
+at its ends; masks, tracks and shapes are made from what is kept, and at the end every frame left out gets the mask and
+the pose (with its covariance and status) of the kept frame that it looks like. Told from the images alone.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float32, Int64
+from numpy import ndarray as Array
+
+from processing.store import Counts, Done
+from recordings.given_masks import GivenMasks
+from recordings.progress import Progress
+from recordings.records import RgbdFrame
+from recordings.results.folder import RobotMasks, read_masks, read_track, write_masks, write_track
+from recordings.session import RgbdFrames, Session, Toss
+from recordings.tracks import RigCalibration
+
+if TYPE_CHECKING:
+    from processing.pipeline import Run
+
+
+@dataclass(frozen=True)
+class StillSettings:
+    """What counts as the same image. Colours and inverse depths are compared as means over blocks, after the light of
+    the whole image (gain and offset) is taken out, with the first frame of the stretch: what creeps is noticed too."""
+
+    block_px: int = 8
+    sigmas: float = 6.0
+    """A block has changed where it differs by more than so many standard deviations of its noise."""
+    least_blocks: int = 3
+    """So many changed blocks are a motion."""
+    color_noise: tuple[float, float] = (0.15, 1.0)
+    """A block's noise, grey levels, is measured between neighbouring frames and taken to be within these: where a
+    camera moves, neighbouring frames differ by more than noise."""
+    depth_noise: tuple[float, float] = (0.001, 0.005)
+    """The same of a block's inverse depth, as a share."""
+    clipped: float = 245.0
+    """Blocks brighter than this do not follow the light."""
+    kept: int = 12
+    """Frames kept at each end of a stretch (at the end of a toss: at its beginning only)."""
+    least: int = 40
+    """Shorter stretches stay whole: usual tosses rest for some ten frames."""
+
+
+@dataclass(frozen=True, eq=False)
+class Kept:
+    """`positions` (m) of the frames that are worked on, and for every frame (n) which of them it looks like."""
+
+    positions: Int64[Array, " m"]
+    like: Int64[Array, " n"]
+
+    @property
+    def digest(self) -> str:
+        """Fingerprint, for the keys of stages."""
+        return hashlib.sha256(self.positions.astype("<i8").tobytes()).hexdigest()
+
+
+@dataclass(frozen=True, eq=False)
+class _Blocks:
+    """Block means of one frame: colours (NaN where clipped), inverse depth (NaN where much of it is missing)."""
+
+    color: Float32[Array, "b c 3"]
+    inverse_depth: Float32[Array, "b c"]
+
+
+def still_stretches(frames: Sequence[RgbdFrame], settings: StillSettings, progress: Progress) -> list[tuple[int, int]]:
+    """First and last position of every run of `settings.least` frames or more in which nothing moves."""
+    blocks = []
+    for i, frame in enumerate(frames):
+        blocks.append(_blocks(frame, settings))
+        progress.step(i + 1, len(frames))
+    noise = _noise(blocks, settings)
+    found, first = [], 0
+    for i in range(1, len(blocks) + 1):
+        if i < len(blocks) and not _moved(blocks[first], blocks[i], noise, settings):
+            continue
+        if i - first >= settings.least:
+            found.append((first, i - 1))
+        first = i
+    return found
+
+
+def kept_of(stretches: Sequence[tuple[int, int]], count: int, settings: StillSettings) -> Kept:
+    """Which of `count` frames are worked on. The first one always is."""
+    left_out = np.zeros(count, dtype=bool)
+    like = np.arange(count)
+    for first, last in stretches:
+        after = last + 1 if last == count - 1 else last + 1 - settings.kept
+        begin, middle = first + settings.kept, (first + settings.kept + after) // 2
+        left_out[begin:after] = True
+        like[begin:after] = begin - 1
+        if after <= last:
+            like[middle:after] = after
+    positions = np.flatnonzero(~left_out)
+    return Kept(positions, np.searchsorted(positions, like))
+
+
+def _blocks(frame: RgbdFrame, settings: StillSettings) -> _Blocks:
+    height, width = frame.depth_m.shape
+    size = (max(1, width // settings.block_px), max(1, height // settings.block_px))
+    color = cv2.resize(frame.color_rgb.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+    valid = (frame.depth_m > 0).astype(np.float32)
+    inverse = np.divide(1.0, frame.depth_m, out=np.zeros_like(frame.depth_m), where=frame.depth_m > 0)
+    share, total = (cv2.resize(x, size, interpolation=cv2.INTER_AREA) for x in (valid, inverse))
+    color[(color > settings.clipped).any(-1)] = np.nan
+    return _Blocks(color, np.where(share > 0.75, total / np.maximum(share, 1e-6), np.nan).astype(np.float32))
+
+
+def _noise(blocks: Sequence[_Blocks], settings: StillSettings) -> tuple[float, float]:
+    """Standard deviation of the difference of a block between two frames at rest, in colour and in inverse depth."""
+    pairs = zip(blocks, blocks[1:])
+    differences = [_difference(a, b) for a, b in pairs]
+    color = float(np.nanmedian([settings.color_noise[0], *(_spread(c) for c, _ in differences)]))
+    depth = float(np.nanmedian([settings.depth_noise[0], *(_spread(d) for _, d in differences)]))
+    return float(np.clip(color, *settings.color_noise)), float(np.clip(depth, *settings.depth_noise))
+
+
+def _spread(values: Float32[Array, "..."]) -> float:
+    known = values[np.isfinite(values)]
+    return 1.4826 * float(np.median(np.abs(known))) if len(known) else float("nan")
+
+
+def _difference(one: _Blocks, other: _Blocks) -> tuple[Float32[Array, "b c 3"], Float32[Array, "b c"]]:
+    """Colours of `other` in the light of `one` minus its own, and the relative difference of inverse depth."""
+    color = np.stack([_in_light_of(one.color[..., k], other.color[..., k]) for k in range(3)], -1) - one.color
+    return color, other.inverse_depth / one.inverse_depth - 1
+
+
+def _in_light_of(one: Float32[Array, "b c"], other: Float32[Array, "b c"]) -> Float32[Array, "b c"]:
+    """Grey levels with the gain and offset that most blocks agree on."""
+    use = np.isfinite(one) & np.isfinite(other)
+    gain, offset = 1.0, 0.0
+    for _ in range(3):
+        if use.sum() < 8 or np.ptp(other[use]) < 1.0:
+            break
+        gain, offset = np.polyfit(other[use], one[use], 1)
+        off = np.abs(gain * other + offset - one)
+        use = np.isfinite(off) & (off <= 3 * 1.4826 * np.nanmedian(off) + 1e-3)
+    return (gain * other + offset).astype(np.float32)
+
+
+def _moved(one: _Blocks, other: _Blocks, noise: tuple[float, float], settings: StillSettings) -> bool:
+    color, depth = _difference(one, other)
+    changed = (np.abs(color) > settings.sigmas * noise[0]).any(-1)
+    further = (np.abs(depth) > settings.sigmas * noise[1]).astype(np.uint8)
+    area = cv2.morphologyEx(further, cv2.MORPH_OPEN, np.ones((2, 2), dtype=np.uint8))  # single blocks: an edge's noise
+    return int(changed.sum()) >= settings.least_blocks or int(area.sum()) >= settings.least_blocks
+
+
+class _ThinnedToss(Toss):
+    """A toss of which only the kept frames are seen."""
+
+    def __init__(self, whole: Toss, kept: Kept) -> None:
+        self.path, self.file, self.calibration = whole.path, whole.file, whole.calibration
+        self.info, self.index = whole.info, whole.index
+        self._kept = kept
+
+    def rgbd(self, camera: str = "d455") -> RgbdFrames:
+        """The kept frames of the camera that the stretches were told from."""
+        frames, at = super().rgbd(camera), self._kept.positions
+        without = tuple(int(i) for i in np.flatnonzero(np.isin(at, frames.without_depth)))
+        return RgbdFrames(frames.times_ns[at], lambda i: frames[int(at[i])], frames.depth_times_ns[at], without,
+                          frames.unused_depth)  # fmt: skip
+
+    def masks(self) -> GivenMasks:
+        """Given masks, at the kept frames that look like theirs."""
+        return super().masks().relabelled(self._kept.like)
+
+
+class ThinnedSession(Session):
+    """A session of whose tosses only the kept frames are seen; `whole` is the session itself."""
+
+    def __init__(self, whole: Session, kept: Mapping[int, Kept]) -> None:
+        super().__init__(whole.path, {"start": whole.start, "stop": whole.stop}, whole.calibration, whole._files)
+        self._open = whole._open
+        self.whole, self._kept = whole, kept
+
+    def toss(self, toss: int) -> Toss:
+        found = super().toss(toss)
+        return _ThinnedToss(found, self._kept[toss]) if toss in self._kept else found
+
+    def with_calibration(self, calibration: RigCalibration) -> ThinnedSession:
+        return ThinnedSession(self.whole.with_calibration(calibration), self._kept)
+
+
+def whole_session(session: Session) -> Session:
+    """The session with every frame that was recorded."""
+    return session.whole if isinstance(session, ThinnedSession) else session
+
+
+def without_waiting(run: Run) -> Run:
+    """The run with few frames of every still stretch; the very same run where there is none."""
+    kept = {t: k for t in run.tosses if (k := _kept_stage(run, t)) is not None}
+    if not kept:
+        return run
+    keys = {f"toss_{t:02d}": hashlib.sha256((run.keys[f"toss_{t:02d}"] + k.digest).encode()).hexdigest()
+            for t, k in kept.items()}  # fmt: skip
+    return replace(run, session=ThinnedSession(run.session, kept), keys={**run.keys, **keys}, kept=kept)
+
+
+def _kept_stage(run: Run, toss: int) -> Kept | None:
+    """Stage `still` of one toss; None where all its frames are worked on."""
+    frames, settings, name = run.session.toss(toss).rgbd(run.camera.frame), run.config.still, f"toss_{toss:02d}"
+    if len(frames) < settings.least:
+        return None
+
+    def compute(folder: Path) -> Counts:
+        found = still_stretches(frames, settings, run.progress(f"toss {toss}: what moves"))
+        kept = kept_of(found, len(frames), settings)
+        document = {"positions": kept.positions.tolist(), "like": kept.like.tolist()}
+        (folder / "still.json").write_text(json.dumps(document) + "\n")
+        return {"frames": len(frames), "kept": len(kept.positions), "stretches": [list(s) for s in found]}
+
+    done = run.store.run("still", 1, settings, {name: run.keys[name]}, compute)
+    if done.counts["kept"] == done.counts["frames"]:
+        return None
+    stored = json.loads((done.folder / "still.json").read_text())
+    return Kept(*(np.array(stored[k], dtype=np.int64) for k in ("positions", "like")))
+
+
+def in_every_frame(run: Run, toss: int, done: Done) -> Done:
+    """A stage's track and masks of one toss in every frame that was recorded (stage `every-frame`)."""
+    if toss not in run.kept:
+        return done
+    kept, frames = run.kept[toss], whole_session(run.session).toss(toss).rgbd(run.camera.frame)
+    stem = f"toss_{toss:02d}"
+
+    def compute(folder: Path) -> Counts:
+        if (done.folder / f"{stem}.track.npz").exists():
+            track = read_track(done.folder, toss)
+            status = tuple(track.status[i] for i in kept.like)
+            poses, covariance = (x[kept.like] for x in (track.camera_from_object, track.covariance))
+            write_track(folder, replace(track, time_ns=frames.times_ns, camera_from_object=poses, status=status,
+                                        covariance=covariance))  # fmt: skip
+        if (done.folder / f"{stem}.masks").exists():
+            seen = read_masks(done.folder, toss)
+            write_masks(folder, toss, list(_masks(seen, kept)), seen.confidence[kept.like])
+            _copy_robot(RobotMasks.of(done.folder, toss), folder / f"{stem}.robot", kept)
+        return {"frames": len(kept.like), "worked_on": len(kept.positions)}
+
+    return run.store.run("every-frame", 1, {"toss": toss}, {"thinned": done.key, "kept": kept.digest}, compute)
+
+
+def _masks(seen: Sequence[Bool[Array, "h w"]], kept: Kept) -> Iterator[Bool[Array, "h w"]]:
+    for i in kept.like:
+        yield seen[int(i)]
+
+
+def _copy_robot(robot: RobotMasks | None, to: Path, kept: Kept) -> None:
+    if robot is None:
+        return
+    to.mkdir()
+    for position, i in enumerate(kept.like):
+        if (source := robot.folder / f"{i:06d}.png").exists():
+            shutil.copyfile(source, to / f"{position:06d}.png")

@@ -1,0 +1,374 @@
+"""What one frame shows of the object, made ready for alignment: smooth depth, normals, looks, outline, samples.
+
+All views of a toss lie in flat arrays (see kernels.py), so that any view can serve as the model for any other: the
+growing model is the set of views at their poses. Nothing is averaged away, nothing limits the object's size, and a
+corrected pose corrects the model.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int64
+from numpy import ndarray as Array
+
+from processing.sensor.rectification import Optics
+from processing.track import kernels as k
+from recordings.records import RgbdFrame
+
+
+@dataclass(frozen=True)
+class ViewConfig:
+    """How a frame is turned into a view."""
+
+    margin_px: int = 14
+    """Rim of the crop around the mask: how far outside the outline still has a slope."""
+    window_px: int = 3
+    """Half width of the window in which depth is fitted by planes."""
+    edge_share: float = 0.012
+    """Depth off a plane by more than this share of the distance belongs to another surface."""
+    smooth_px: float = 2.5
+    """Blur of the smooth grey level, which widens the basin of attraction."""
+    rim_px: float = 2.0
+    rim_share: float = 0.05
+    """Looks so near to the outline (pixels; at most this share of the object's size) are mixed with the background's by
+    optics and JPEG: they would stay with the picture. Those farther inside are blurred outwards over them."""
+    shade_px: float = 5.0
+    """Scale over which brightness is levelled: shading and exposure are no texture."""
+    bright_gain: float = 0.5
+    """Of levelled brightness: shadows and highlights stay with the room and mislead."""
+    color_gain: float = 3.0
+    """Of colour differences: shading leaves them alone, so that a faint one tells more than a strong shadow."""
+    jump_m: float = 0.015
+    """A step of depth inside the outline (beyond a slope's): near it, the far surface gets the near one's depth ..."""
+    jump_px: int = 3
+    """... so that no samples are taken so near to it (they would stay with the picture, not with the object)."""
+    samples: int = 500
+    """Surface points of a view that alignment uses."""
+    least_samples: int = 40
+    """A view with fewer cannot be tracked."""
+    cover_m: float = 0.015
+    """What is nearer than the object by this may cover it."""
+    above_table_m: float = 0.02
+    """What is lower above the table than this is the table, which covers nothing."""
+
+
+@dataclass(frozen=True, eq=False)
+class Crop:
+    """The rectified pixels around the object in one frame: all that later steps need of it."""
+
+    position: int
+    corner: tuple[int, int]
+    """u, v of the crop's first pixel."""
+    mask: Bool[Array, "h w"]
+    depth_m: Float32[Array, "h w"]
+    color: Float32[Array, "h w 3"]
+    """RGB 0..1 at the session's usual exposure."""
+    covered: Bool[Array, "h w"]
+    """Pixels outside the mask where something nearer may hide the object."""
+    height_m: Float32[Array, "h w"] | None
+    depth_delay_s: float
+    """Depth's exposure time minus colour's."""
+    colorless: Bool[Array, "h w"] | None = None
+    """Pixels of the mask whose colour is not the object's; None: there are none."""
+
+
+def cut(
+    frame: RgbdFrame,
+    mask: Bool[Array, "h w"],
+    position: int,
+    optics: Optics,
+    gain: float,
+    config: ViewConfig,
+    camera_from_world: Float[Array, "4 4"] | None = None,
+    colorless: Bool[Array, "h w"] | None = None,
+) -> Crop | None:
+    """The crop around the mask, or None where the mask holds too little. `camera_from_world` has the table at z = 0;
+    `colorless` marks pixels of the mask that show something else's colour."""
+    straight_mask = optics.straight(mask.astype(np.uint8), smooth=False) > 0
+    rows, columns = np.flatnonzero(straight_mask.any(1)), np.flatnonzero(straight_mask.any(0))
+    h, w = straight_mask.shape
+    if len(rows) == 0 or int(straight_mask.sum()) < config.least_samples:
+        return None
+    top, bottom = max(int(rows[0]) - config.margin_px, 0), min(int(rows[-1]) + config.margin_px + 1, h)
+    left, right = max(int(columns[0]) - config.margin_px, 0), min(int(columns[-1]) + config.margin_px + 1, w)
+    area = np.s_[top:bottom, left:right]
+    color = optics.straight(frame.color_rgb, smooth=True)[area].astype(np.float32) / np.float32(255.0 * gain)
+    depth_m = np.ascontiguousarray(optics.straight(frame.depth_m, smooth=False)[area])
+    inside = np.ascontiguousarray(straight_mask[area])
+    height_m = _heights(depth_m, (left, top), optics, camera_from_world)
+    covered = _covered(depth_m, inside, height_m, config)
+    delay_s = (frame.depth_time_ns - frame.time_ns) * 1e-9
+    foreign = None if colorless is None else optics.straight(colorless.astype(np.uint8), smooth=False)[area] > 0
+    return Crop(position, (int(left), int(top)), inside, depth_m, color, covered, height_m, delay_s, foreign)
+
+
+def _heights(
+    depth_m: Float32[Array, "h w"],
+    corner: tuple[int, int],
+    optics: Optics,
+    camera_from_world: Float[Array, "4 4"] | None,
+) -> Float32[Array, "h w"] | None:
+    """Height above the table of every pixel; None where the table is not known."""
+    if camera_from_world is None:
+        return None
+    up = camera_from_world[:3, 2]
+    v, u = np.indices(depth_m.shape)
+    x = (u + corner[0] - optics.camera.cx) / optics.camera.fx
+    y = (v + corner[1] - optics.camera.cy) / optics.camera.fy
+    height = depth_m * (up[0] * x + up[1] * y + up[2]) - up @ camera_from_world[:3, 3]
+    return height.astype(np.float32)
+
+
+def _covered(
+    depth_m: Float32[Array, "h w"],
+    inside: Bool[Array, "h w"],
+    height_m: Float32[Array, "h w"] | None,
+    config: ViewConfig,
+) -> Bool[Array, "h w"]:
+    """Where something nearer than the object's nearest mask pixel stands, the table excepted."""
+    seen = inside & (depth_m > 0)
+    if not seen.any():
+        return np.zeros_like(inside)
+    _, label = cv2.distanceTransformWithLabels((~seen).astype(np.uint8), cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL)
+    by_label = np.zeros(int(label.max()) + 1, dtype=np.float32)
+    by_label[label[seen]] = depth_m[seen]
+    covered = ~inside & (depth_m > 0) & (depth_m < by_label[label] - config.cover_m)
+    if height_m is not None:
+        covered &= height_m > config.above_table_m
+    return np.asarray(covered)
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """One view: `pixels` (h, w, CHANNELS) and `samples` (n, SAMPLE) as kernels.py has them."""
+
+    position: int
+    corner: tuple[int, int]
+    pixels: Float32[Array, "h w c"]
+    samples: Float32[Array, "n s"]
+
+    @property
+    def center_m(self) -> Float[Array, "3"]:
+        """Middle of the seen surface, camera frame."""
+        return np.asarray(np.median(self.samples[:, :3], axis=0), dtype=np.float64)
+
+
+def make_view(crop: Crop, optics: Optics, config: ViewConfig, motion: Float[Array, "4 4"] | None = None) -> View | None:
+    """Depth made smooth, normals, levelled looks, distance to the outline, samples.
+
+    `motion` (4x4, camera frame) moves the object from its place at depth's exposure to that at colour's; None: at rest.
+    None is returned where too few points are left.
+    """
+    depth_m = _cleaned(crop, config) if motion is None else _moved_depth(crop, optics, motion, config)
+    inside = cv2.erode(crop.mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    h, w = crop.mask.shape
+    pixels = np.zeros((h, w, k.CHANNELS), dtype=np.float32)
+    rays = _ray_steps(crop.corner, optics)
+    smooth_m, normals = np.zeros((h, w), dtype=np.float32), np.zeros((h, w, 3), dtype=np.float32)
+    k.fit_surface(depth_m, inside, rays, config.window_px, config.edge_share, smooth_m, normals)
+    pixels[..., k.Z], pixels[..., k.NX : k.NZ + 1] = smooth_m, normals
+    outside = cv2.distanceTransform((~crop.mask).astype(np.uint8), cv2.DIST_L2, 5)
+    pixels[..., k.OUTSIDE] = np.where(crop.covered, k.HIDDEN, outside)
+    pixels[..., k.SHARP :] = _looks(crop, config)
+    samples = _samples(pixels, rays, config, crop.position)
+    return View(crop.position, crop.corner, pixels, samples) if len(samples) >= config.least_samples else None
+
+
+def _ray_steps(corner: tuple[int, int], optics: Optics) -> Float[Array, "4"]:
+    c = optics.camera
+    return np.array([1 / c.fx, 1 / c.fy, (corner[0] - c.cx) / c.fx, (corner[1] - c.cy) / c.fy])
+
+
+def _cleaned(crop: Crop, config: ViewConfig) -> Float32[Array, "h w"]:
+    """Depth inside the mask, without what lies far from the object's bulk."""
+    inside = crop.mask & (crop.depth_m > 0)
+    if not inside.any():
+        return np.zeros_like(crop.depth_m)
+    return np.where(inside & _near_bulk(crop.depth_m, inside), crop.depth_m, np.float32(0))
+
+
+def _near_bulk(depth_m: Float32[Array, "h w"], inside: Bool[Array, "h w"]) -> Bool[Array, "h w"]:
+    """Depth within the object's possible reach: no farther from its median than 1.5 times its 10-90 % spread + 5 cm."""
+    low, middle, high = np.quantile(depth_m[inside], [0.1, 0.5, 0.9])
+    reach = 0.05 + 1.5 * (high - low)
+    return np.asarray(np.abs(depth_m - middle) < reach)
+
+
+def _moved_depth(crop: Crop, optics: Optics, motion: Float[Array, "4 4"], config: ViewConfig) -> Float32[Array, "h w"]:
+    """Depth as it would have been at colour's exposure: the object's points moved, then seen again (nearest wins)."""
+    dx, dy, x0, y0 = _ray_steps(crop.corner, optics)
+    depth_m = crop.depth_m.copy()
+    h, w = depth_m.shape
+    center = crop.depth_m[crop.mask & (crop.depth_m > 0)]
+    if len(center) == 0:
+        return np.zeros_like(depth_m)
+    z = float(np.median(center))
+    shift_px = motion[:2, :3] @ [0, 0, z] + motion[:2, 3]
+    reach = int(np.ceil(np.abs(shift_px).max() / z * optics.camera.fx)) + 2
+    grown = cv2.dilate(crop.mask.astype(np.uint8), np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)) > 0
+    use = grown & (depth_m > 0) & _near_bulk(depth_m, crop.mask & (depth_m > 0))
+    if crop.height_m is not None:
+        use &= crop.mask | (crop.height_m > 0.5 * config.above_table_m)
+    v, u = np.nonzero(use)
+    points = np.stack([(x0 + dx * u), (y0 + dy * v), np.ones(len(u))], -1) * depth_m[v, u][:, None]
+    moved = points @ motion[:3, :3].T + motion[:3, 3]
+    uu = np.round((moved[:, 0] / moved[:, 2] - x0) / dx).astype(int)
+    vv = np.round((moved[:, 1] / moved[:, 2] - y0) / dy).astype(int)
+    ok = (uu >= 0) & (vv >= 0) & (uu < w) & (vv < h)
+    out = np.full((h, w), np.inf, dtype=np.float32)
+    np.minimum.at(out, (vv[ok], uu[ok]), moved[ok, 2].astype(np.float32))
+    return np.where(np.isfinite(out) & crop.mask, out, np.float32(0))
+
+
+def _looks(crop: Crop, config: ViewConfig) -> Float32[Array, "h w 6"]:
+    """Brightness divided by that around it (shading and shadows stay with the room, not with the object), and two
+    differences of colour, each sharp and smooth."""
+    color, mask = crop.color, crop.mask
+    foreign = None if crop.colorless is None else cv2.dilate(crop.colorless.astype(np.uint8), np.ones((3, 3))) > 0
+    rim_px = min(config.rim_px, config.rim_share * float(np.sqrt(mask.sum())))
+    own = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, 5) > rim_px
+    weight = (own if foreign is None else own & ~foreign).astype(np.float32)
+    red, green, blue = color[..., 0], color[..., 1], color[..., 2]
+    gray = 0.299 * red + 0.587 * green + 0.114 * blue
+    total = red + green + blue + 0.1
+    looks = (
+        config.bright_gain * (gray / (_masked_blur(gray, weight, config.shade_px) + 0.03) - 1.0),
+        config.color_gain * (red - green) / total,
+        config.color_gain * (blue - 0.5 * (red + green)) / total,
+    )
+    smooth = [_masked_blur(look, weight, config.smooth_px) for look in looks]
+    sharp = [np.where(own, look, blurred) for look, blurred in zip(looks, smooth)]
+    out = np.stack([*sharp, *smooth], -1).astype(np.float32)
+    if foreign is not None:
+        out[foreign & mask] = k.NO_LOOK
+    return out
+
+
+def _masked_blur(image: Float32[Array, "h w"], weight: Float32[Array, "h w"], sigma_px: float) -> Float32[Array, "h w"]:
+    above = cv2.GaussianBlur(image * weight, (0, 0), sigma_px)
+    return above / np.maximum(cv2.GaussianBlur(weight, (0, 0), sigma_px), 1e-3)
+
+
+def _near_jumps(depth_m: Float32[Array, "h w"], slope: float, config: ViewConfig) -> Bool[Array, "h w"]:
+    """Pixels close to a step of depth between two surfaces of the object."""
+    seen = depth_m > 0
+    small = np.ones((3, 3), np.uint8)
+    high = cv2.dilate(depth_m, small)
+    low = cv2.erode(np.where(seen, depth_m, np.float32(1e3)), small)
+    steps = (seen & (high - low > config.jump_m + slope * depth_m)).astype(np.uint8)
+    wide = np.ones((2 * config.jump_px + 1, 2 * config.jump_px + 1), np.uint8)
+    return np.asarray(cv2.dilate(steps, wide) > 0)
+
+
+def _samples(
+    pixels: Float32[Array, "h w c"], rays: Float[Array, "4"], config: ViewConfig, seed: int
+) -> Float32[Array, "n s"]:
+    v, u = np.nonzero((pixels[..., k.Z] > 0) & ~_near_jumps(pixels[..., k.Z], 5.0 * float(rays[0]), config))
+    order = np.random.default_rng(seed).permutation(len(u))[: config.samples]
+    u, v = u[order], v[order]
+    seen = pixels[v, u]
+    directions = np.stack([rays[2] + rays[0] * u, rays[3] + rays[1] * v, np.ones(len(u))], -1)
+    points = directions * seen[:, k.Z, None]
+    return np.concatenate([points, seen[:, k.NX : k.NZ + 1], seen[:, k.SHARP :]], -1).astype(np.float32)
+
+
+STILL_OUTLINE, STILL_PX, STILL_BRIGHTNESS = 0.96, 0.3, 0.03
+"""Overlap of outlines, shift of their middle and change of brightness of an object that stands still."""
+
+
+def _on_common_ground(one: Crop, two: Crop) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+    """Mask and brightness of two crops over the pixels that both cover."""
+    left, top = np.maximum(one.corner, two.corner)
+    ends = [np.add(c.corner, c.mask.shape[::-1]) for c in (one, two)]
+    right, bottom = np.minimum(*ends)
+    out = []
+    for c in (one, two):
+        area = np.s_[top - c.corner[1] : bottom - c.corner[1], left - c.corner[0] : right - c.corner[0]]
+        out.append((c.mask[area], c.color[area].mean(-1)))
+    return out[0], out[1]
+
+
+class ViewStore:
+    """The views of one or several tosses in the flat arrays that the kernels read."""
+
+    def __init__(self, optics: Optics, crops: list[Crop | None], config: ViewConfig) -> None:
+        sizes = [0 if c is None else int(c.mask.size) for c in crops]
+        self.optics, self.crops, self.config = optics, crops, config
+        self.maps = np.zeros((sum(sizes), k.CHANNELS), dtype=np.float32)
+        self.samples = np.zeros((config.samples * len(crops), k.SAMPLE), dtype=np.float32)
+        self.table: Int64[Array, "n 7"] = np.zeros((len(crops), 7), dtype=np.int64)
+        self.center_m = np.full((len(crops), 3), np.nan)
+        self.motion: list[Float[Array, "4 4"] | None] = [None] * len(crops)
+        for i, offset in enumerate(np.cumsum([0, *sizes[:-1]]) if sizes else []):
+            self.table[i, k.OFFSET], self.table[i, k.FIRST] = offset, i * config.samples
+
+    def __len__(self) -> int:
+        return len(self.crops)
+
+    def usable(self, i: int) -> bool:
+        return bool(self.table[i, k.COUNT] > 0)
+
+    def fill(self, i: int, motion: Float[Array, "4 4"] | None = None) -> bool:
+        """Make view i (again), with the object's motion from depth's to colour's exposure. False: nothing to see."""
+        crop = self.crops[i]
+        view = None if crop is None else make_view(crop, self.optics, self.config, motion)
+        self.table[i, k.COUNT] = 0
+        if view is None or crop is None:
+            return False
+        h, w = crop.mask.shape
+        offset, first, n = int(self.table[i, k.OFFSET]), int(self.table[i, k.FIRST]), len(view.samples)
+        self.maps[offset : offset + h * w] = view.pixels.reshape(-1, k.CHANNELS)
+        self.samples[first : first + n] = view.samples
+        self.table[i, [k.U0, k.V0, k.WIDTH, k.HEIGHT, k.COUNT]] = [*view.corner, w, h, n]
+        self.center_m[i] = view.center_m
+        self.motion[i] = motion
+        return True
+
+    def stands_still(self, i: int, j: int) -> bool:
+        """Whether the object has not moved between two frames, as far as its outline and brightness tell."""
+        one, two = self.crops[i], self.crops[j]
+        if one is None or two is None or max(np.abs(np.subtract(one.corner, two.corner))) > 3:
+            return False
+        a, b = _on_common_ground(one, two)
+        both, either = int((a[0] & b[0]).sum()), int((a[0] | b[0]).sum())
+        if both < STILL_OUTLINE * either:
+            return False
+        move_px = np.abs(np.mean(np.nonzero(a[0]), axis=1) - np.mean(np.nonzero(b[0]), axis=1)).max()
+        change = np.median(np.abs(a[1] - b[1])[a[0] & b[0]])
+        return bool(move_px < STILL_PX and change < STILL_BRIGHTNESS)
+
+    def only(self, views: Int64[Array, " m"]) -> ViewStore:
+        """The same store with some of its views alone (pixels copied)."""
+        out = ViewStore(self.optics, [self.crops[int(i)] for i in views], self.config)
+        for new, i in enumerate(views):
+            crop, row = out.crops[new], self.table[i]
+            size = 0 if crop is None else crop.mask.size
+            offset, first, n = int(out.table[new, k.OFFSET]), int(out.table[new, k.FIRST]), int(row[k.COUNT])
+            out.maps[offset : offset + size] = self.maps[row[k.OFFSET] : row[k.OFFSET] + size]
+            out.samples[first : first + n] = self.samples[row[k.FIRST] : row[k.FIRST] + n]
+            out.table[new, k.U0 : k.HEIGHT + 1], out.table[new, k.COUNT] = row[k.U0 : k.HEIGHT + 1], n
+            out.center_m[new], out.motion[new] = self.center_m[i], self.motion[int(i)]
+        return out
+
+    @staticmethod
+    def joined(stores: list[ViewStore]) -> ViewStore:
+        """All views of several stores in one, in order; they must have one camera."""
+        out = ViewStore.__new__(ViewStore)
+        out.optics, out.config = stores[0].optics, stores[0].config
+        out.crops = [c for s in stores for c in s.crops]
+        out.motion = [m for s in stores for m in s.motion]
+        out.maps = np.concatenate([s.maps for s in stores])
+        out.samples = np.concatenate([s.samples for s in stores])
+        out.center_m = np.concatenate([s.center_m for s in stores])
+        tables, pixels, samples = [], 0, 0
+        for s in stores:
+            table = s.table.copy()
+            table[:, k.OFFSET] += pixels
+            table[:, k.FIRST] += samples
+            pixels, samples = pixels + len(s.maps), samples + len(s.samples)
+            tables.append(table)
+        out.table = np.concatenate(tables)
+        return out

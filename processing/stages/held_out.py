@@ -1,0 +1,157 @@
+"""Passes compared by contact: shape, friction and inertia learned from one half of the tosses and judged on the other,
+both ways.
+
+A half takes the row's own way: the shape that contact corrects from this half alone goes into a second pass of its own,
+so nothing that contact told of the judged tosses is in the shape they are judged by. What all tosses showed the camera
+is; and poses are the row's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from scipy.optimize import minimize_scalar
+
+from processing.stages.contact import contact_stage
+from processing.stages.vision import CAMERA
+from processing.store import Counts, Done
+from recordings.errors import BadInput
+from recordings.geometry import Transform
+from recordings.results.folder import read_contact, read_shape, read_track
+from recordings.session_writer import write_json
+from recordings.tracks import ContactModel, ObjectShape, ObjectTrack
+
+if TYPE_CHECKING:
+    from processing.contact.learn.shape_comparison import TossLoss
+    from processing.pipeline import Run
+
+LEAST_TOSSES = 4
+"""From which on there are halves: learned from fewer than two tosses, friction is hardly known."""
+ALONE = "passes are compared by images alone, not by the contact of tosses held out"
+
+
+@dataclass(frozen=True, eq=False)
+class Half:
+    """What is known where contact is learned from the tosses `learned_from` alone: the shape so far, and (None: not
+    learned yet) the stage `contact` that corrected it, with friction and inertia. `judged` are the other tosses."""
+
+    learned_from: tuple[int, ...]
+    judged: tuple[int, ...]
+    shape: Done
+    contact: Done | None = None
+
+    @property
+    def name(self) -> str:
+        return f"contact from tosses {_listed(self.learned_from)} alone"
+
+
+def halves_of(tracks: Mapping[int, Done], shapes: Mapping[int, Done]) -> tuple[Half, ...]:
+    """Every other toss, and the rest, with a shape that no contact was learned for; none where tosses are too few or do
+    not share a shape."""
+    if len(tracks) < LEAST_TOSSES or len({s.key for s in shapes.values()}) > 1:
+        return ()
+    tosses, shape = sorted(tracks), next(iter(shapes.values()))
+    first, second = tuple(tosses[::2]), tuple(tosses[1::2])
+    return Half(first, second, shape), Half(second, first, shape)
+
+
+def learned_by(run: Run, halves: Sequence[Half], tracks: Mapping[int, Done], name: str) -> tuple[Half, ...]:
+    """Contact learned by each half from its own tosses. None of them where a half cannot learn: one alone would not
+    judge both ways."""
+    found = []
+    for half in halves:
+        own = {t: tracks[t] for t in half.learned_from}
+        learned = contact_stage(run, f"{name}, {half.name}", own, half.shape)
+        if learned.counts.get("kept_out"):
+            return ()
+        found.append(replace(half, contact=learned))
+    return tuple(found)
+
+
+def why_no_halves(tracks: Mapping[int, Done], losses: Mapping[int, float]) -> tuple[str, ...]:
+    """What to say where no toss was held out."""
+    if losses:
+        return ()
+    if len(tracks) < LEAST_TOSSES:
+        return (f"fewer than {LEAST_TOSSES} tosses together: {ALONE}",)
+    return (f"contact cannot be learned from each half of the tosses: {ALONE}",)
+
+
+def held_out_losses(run: Run, name: str, tracks: Mapping[int, Done], halves: Sequence[Half]) -> dict[int, float]:
+    """Contact loss (J) of every toss by the half that did not learn from it; empty without halves, or where a half has
+    no toss that can be used."""
+    found: dict[int, float] = {}
+    for half in halves:
+        losses = held_out_stage(run, name, tracks, half).counts.get("loss_j", {})
+        if not losses:
+            return {}
+        found |= {int(t): float(x) for t, x in losses.items()}
+    return dict(sorted(found.items()))
+
+
+def held_out_stage(run: Run, name: str, tracks: Mapping[int, Done], half: Half) -> Done:
+    """Stage `held-out`: the contact loss of the judged tosses by a half's shape, friction and inertia.
+
+    At the height of the plane that suits the half's own tosses best: size and height are not identifiable together, and
+    a shape that grew would else be charged for a plane that lies too high.
+    """
+    if half.contact is None:
+        raise ValueError("a half judges after it has learned contact")
+    learned = half.contact
+    inputs = {"shape": half.shape.key, "learned": learned.key, "judged": _listed(half.judged)}
+    inputs |= {**{f"track_{t:02d}": d.key for t, d in tracks.items()}, "calibration": run.keys["calibration"]}
+
+    def compute(folder: Path) -> Counts:
+        run.progress(f"{name}: contact loss of tosses not learned from").step(0, 1, "")
+        own, others = (
+            {t: read_track(tracks[t].folder, t) for t in tosses} for tosses in (half.learned_from, half.judged)
+        )
+        world_from_camera = run.session.calibration.transform("world", CAMERA)
+        try:
+            shape, model = read_shape(half.shape.folder), read_contact(learned.folder)
+            raised_m = best_height_m(own, shape, model, world_from_camera)
+            losses = losses_at(raised_m, others, shape, model, world_from_camera)
+        except BadInput as why:
+            return {"kept_out": str(why)}
+        write_json(folder / "losses.json", {str(t): asdict(x) for t, x in losses.items()})
+        return {"loss_j": {str(t): x.loss_j for t, x in losses.items()}, "raised_m": raised_m}
+
+    return run.store.run("held-out", 3, {}, inputs, compute)
+
+
+HEIGHTS_M = (-0.004, 0.004)
+"""How far the plane may lie from where calibration has it."""
+
+
+def best_height_m(
+    poses: Mapping[int, ObjectTrack], shape: ObjectShape, model: ContactModel, world_from_camera: Transform
+) -> float:
+    """How far (m) the plane is raised where the mean loss of these tosses is least."""
+    from processing.contact.learn.shape_comparison import mean_loss_j
+
+    def mean_j(raised_m: float) -> float:
+        return mean_loss_j(losses_at(raised_m, poses, shape, model, world_from_camera))
+
+    return float(minimize_scalar(mean_j, bounds=HEIGHTS_M, method="bounded", options={"xatol": 2e-4}).x)
+
+
+def losses_at(
+    raised_m: float,
+    poses: Mapping[int, ObjectTrack],
+    shape: ObjectShape,
+    model: ContactModel,
+    world_from_camera: Transform,
+) -> dict[int, TossLoss]:
+    """Contact losses above the plane raised by so much (m)."""
+    from processing.contact.learn.shape_comparison import contact_loss_of
+    from processing.contact.physics.plane import Plane
+
+    plane = Plane(model.plane_normal_world, model.plane_offset_m + float(raised_m), "the contact model")
+    return contact_loss_of(poses, shape, model, world_from_camera, plane)
+
+
+def _listed(tosses: Sequence[int]) -> str:
+    return ", ".join(map(str, tosses))

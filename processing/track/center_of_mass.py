@@ -1,0 +1,62 @@
+"""Where the body's middle of mass is, from its free flight."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from numpy import ndarray as Array
+
+from processing.track.beam import Scene
+from processing.track.joint_refinement import Motion, motion_residual
+
+
+def center_of_mass(poses: Float[Array, "n 4 4"], use: Bool[Array, " n"], scene: Scene) -> Float[Array, "3"]:
+    """From the longest run of views whose motion is that of free flight."""
+    index = np.flatnonzero(use)
+    motion = Motion(
+        scene.times_s, np.zeros(len(poses), dtype=np.int64), scene.gravity_camera_m_s2, scene.center_m, ~use
+    )
+    fly = -scene.gravity_camera_m_s2
+    free = []
+    for a, b, c in zip(index, index[1:], index[2:]):
+        steps = scene.times_s[[a, b, c]]
+        residual, _ = motion_residual((poses[a], poses[b], poses[c]), steps, motion)
+        centers = [poses[x][:3, :3] @ scene.center_m + poses[x][:3, 3] for x in (a, b, c)]
+        change = (centers[2] - centers[1]) / (steps[2] - steps[1]) - (centers[1] - centers[0]) / (steps[1] - steps[0])
+        falls = float(change @ -fly) / (0.5 * (steps[2] - steps[0])) > 0.6 * float(fly @ fly)
+        free.append(bool(falls and np.linalg.norm(residual[:3]) < 3.0))
+    run = _longest_run(free)
+    flying = index[run.start : run.stop + 2] if run.stop > run.start else index[:0]
+    return flight_center(poses, scene.times_s, scene.gravity_camera_m_s2, flying, scene.center_m)
+
+
+def flight_center(
+    poses: Float[Array, "n 4 4"], times_s: Float[Array, " n"], gravity_camera_m_s2: Float[Array, "3"],
+    flying: Int[Array, " m"], guess_m: Float[Array, "3"], sigma_m: float = 0.03,
+) -> Float[Array, "3"]:  # fmt: skip
+    """Centre of mass (object frame) from views in free flight: R_i c + t_i = p + v t + g t^2 / 2, least squares for
+    c, p, v, held to `guess_m` with `sigma_m`. The guess where there are too few views."""
+    if len(flying) < 5:
+        return guess_m
+    t = times_s[flying] - times_s[flying[0]]
+    m = len(flying)
+    A = np.zeros((3 * m + 3, 9))
+    b = np.zeros(3 * m + 3)
+    for n, i in enumerate(flying):
+        A[3 * n : 3 * n + 3, :3] = poses[i, :3, :3]
+        A[3 * n : 3 * n + 3, 3:6] = -np.eye(3)
+        A[3 * n : 3 * n + 3, 6:] = -t[n] * np.eye(3)
+        b[3 * n : 3 * n + 3] = 0.5 * gravity_camera_m_s2 * t[n] ** 2 - poses[i, :3, 3]
+    fit_m = 0.002
+    A[-3:, :3], b[-3:] = fit_m / sigma_m * np.eye(3), fit_m / sigma_m * guess_m
+    return np.asarray(np.linalg.lstsq(A, b, rcond=None)[0][:3])
+
+
+def _longest_run(flags: list[bool]) -> range:
+    best, start = range(0), 0
+    for i, flag in enumerate([*flags, False]):
+        if not flag:
+            if i - start > len(best):
+                best = range(start, i)
+            start = i + 1
+    return best

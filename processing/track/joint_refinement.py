@@ -1,0 +1,382 @@
+"""Joint refinement: every view against every view that sees the same surface, all poses at once (Gauss-Newton).
+
+The residuals are the images themselves (depth, grey, outline) of each pair, so that a pair of far apart times closes a
+loop without a feature match; a weak pull towards free flight holds what the images leave open. Solved for twists
+(translation, rotation) of the object frame per view: object_from_camera <- exp(twist) object_from_camera.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from numpy import ndarray as Array
+
+from processing.motion.motion_prior import turn_between
+from processing.sensor.view import ViewStore
+from processing.track import kernels as k
+from processing.track.beam import Schedule, rows
+from processing.track.keyframes import view_directions
+from recordings.geometry import rotation_log, skew
+
+
+@dataclass(frozen=True)
+class GraphConfig:
+    """Which pairs are compared, how long, and how much free flight weighs."""
+
+    neighbours: int = 2
+    """Frames before and after that a view is compared with."""
+    loops: int = 6
+    """Views from near directions, whatever their time, that a view is compared with."""
+    co_visible_deg: float = 50.0
+    least_loops: int = 2
+    wide_deg: float = 70.0
+    """A view with fewer loops takes some from directions so far apart: they err more, but a chain drifts."""
+    spread_in_time: int = 3
+    """Of frames nearer to each other in time than this, or between which the object stands still, only one is taken for
+    loops."""
+    schedule: Schedule = (
+        (1, 2, 0.006, 0.4, 0.008, 0.3),
+        (0, 3, 0.004, 0.4, 0.006, 0.5),
+        (0, 3, 0.003, 0.15, 0.002, 1.0),
+        (0, 5, 0.0035, 0.08, 0.002, 1.0),
+    )
+    """The last row weighs looks more: they err by a tenth of a pixel, and whole patches of depth err together. The
+    outline, good to half a pixel, holds the turn of bodies whose looks say little."""
+    sure_cost: float = 0.08
+    """A pair that fits worse counts less."""
+    spin_change_rad_s: float = 0.5
+    """Standard deviation of the change of spin between frames in flight (not an impact)."""
+    velocity_change_m_s: float = 0.06
+    """... and of the velocity beyond gravity's share."""
+    jerk_rad_s: float | None = 0.25
+    """Standard deviation of the change of that change: spin changes slowly in flight and while an arm swings."""
+    still_rad: float = 0.003
+    still_m: float = 0.0002
+    """What a body that stands still may move between frames (standard deviation)."""
+    carried_rad: float = 0.0003
+    carried_m: float = 0.00012
+    """Standard deviation of what a held body moves in the hand from frame to frame (slipping is an outlier) ..."""
+    held_rad: float = 0.08
+    held_m: float = 0.015
+    """... and what moves more is not held."""
+    round_body: bool = False
+    """Surfaces that turn away from the camera and brightness count little: on a round body they stay with the view."""
+    shared_noise: float = 8.0
+    """A view's pairs share its noise: together they count as one, so many times over."""
+
+
+def steady_motion() -> GraphConfig:
+    """Settings under which steady motion outweighs what the images say."""
+    rough = ((1, 6, 0.006, 0.4, 0.008, 0.3), (1, 6, 0.006, 0.4, 0.008, 0.5))
+    return GraphConfig(shared_noise=200.0, jerk_rad_s=0.1, schedule=(*rough, *GraphConfig().schedule[1:]))
+
+
+def round_views() -> GraphConfig:
+    """Settings for views that a round body's profile ties already: pairs of them, which drift, count little."""
+    fine = ((1, 2, 0.006, 0.4, 0.008, 0.3), (0, 4, 0.003, 0.15, 0.005, 0.3), (0, 6, 0.0035, 0.08, 0.005, 0.3))
+    return GraphConfig(round_body=True, shared_noise=100.0, schedule=fine)
+
+
+@runtime_checkable
+class Terms(Protocol):
+    """What else is known of poses."""
+
+    def add(
+        self, H: Float[Array, "f f 6 6"], g: Float[Array, "f 6"], poses: Float[Array, "n 4 4"], place: Int[Array, " n"]
+    ) -> None:
+        """Adds to normal equations for the twists of the object frame per unknown; `place`: that of each view, -1
+        where it is fixed."""
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """What the pull towards free flight needs: times, gravity (camera axes), the body's middle (object frame),
+    and which views follow each other within one toss (views of other tosses have other numbers)."""
+
+    times_s: Float[Array, " n"]
+    toss: Int[Array, " n"]
+    gravity_camera_m_s2: Float[Array, "3"]
+    center_m: Float[Array, "3"]
+    still: Bool[Array, " n"]
+    """Whether the object stands still between each view and the one before it in its toss."""
+    carried: Mapping[tuple[int, int], Float[Array, "4 4"]] = field(default_factory=dict)
+    """How the robot's hand moves (camera axes) from one view to the next."""
+
+
+@dataclass(frozen=True, eq=False)
+class Refined:
+    """Poses after joint refinement, the covariance of each (twist of the object frame, translation first), the pairs
+    (i, k) and their figures: mean cost, share on the surface, share of violations."""
+
+    poses: Float[Array, "n 4 4"]
+    covariance: Float[Array, "n 6 6"]
+    pairs: Int[Array, "m 2"]
+    figures: Float[Array, "m 3"]
+
+
+def choose_pairs(
+    poses: Float[Array, "n 4 4"], use: Bool[Array, " n"], toss: Int[Array, " n"], center_m: Float[Array, "3"],
+    still: Bool[Array, " n"], config: GraphConfig,
+) -> Int[Array, "m 2"]:  # fmt: skip
+    """Pairs (i, k), both ways: neighbours in time, and views from near directions spread over time and tosses. `still`:
+    whether the object stands still between each view and the one before it."""
+    index = np.flatnonzero(use)
+    directions = view_directions(poses[index], center_m)
+    cosine = np.clip(directions @ directions.T, -1, 1)
+    chosen: set[tuple[int, int]] = set()
+    stay = np.cumsum(~still)
+    for a, i in enumerate(index):
+        later = [int(j) for j in index[a + 1 : a + 1 + config.neighbours] if toss[j] == toss[i]]
+        taken = [int(i), *later]
+        chosen.update((int(i), j) for j in later)
+        wanted = config.loops
+        for b in np.argsort(-cosine[a]):
+            j = int(index[b])
+            few = config.loops - wanted < config.least_loops
+            if wanted == 0 or cosine[a, b] < np.cos(np.radians(config.wide_deg if few else config.co_visible_deg)):
+                break
+            if any(toss[j] == toss[t] and (abs(j - t) < config.spread_in_time or stay[j] == stay[t]) for t in taken):
+                continue
+            taken.append(j)
+            chosen.add((min(int(i), j), max(int(i), j)))
+            wanted -= 1
+    one_way = np.array(sorted(chosen), dtype=np.int64).reshape(-1, 2)
+    return np.concatenate([one_way, one_way[:, ::-1]])
+
+
+def refine(
+    store: ViewStore,
+    poses: Float[Array, "n 4 4"],
+    use: Bool[Array, " n"],
+    fixed: Bool[Array, " n"],
+    motion: Motion,
+    config: GraphConfig,
+    held: Float[Array, "6"] | None = None,
+    tied: Int[Array, " n"] | None = None,
+    beside: Sequence[Terms] = (),
+) -> Refined:
+    """All poses in `use` at once; those in `fixed` stay. `poses` of other views are returned as they are. No pose moves
+    along the twist `held`, where there is one. Views with the same number in `tied` move as one (not at all with a
+    fixed one); those with -1 move alone. `beside`: what else is known of the poses."""
+    poses = poses.copy()
+    free = use & ~fixed
+    place = np.where(free, np.cumsum(free) - 1, -1)
+    if tied is not None:
+        place = _tied(place, np.where(use, tied, -1))
+    pairs = choose_pairs(poses, use, motion.toss, motion.center_m, motion.still, config)
+    pairs = pairs[place[pairs[:, 0]] != place[pairs[:, 1]]]
+    distance = float(np.median(np.linalg.norm(store.center_m[use], axis=1)))
+    figures = np.zeros((len(pairs), 3))
+    H = np.eye(6 * (int(place.max(initial=-1)) + 1))
+    for row in rows(config.schedule, distance, config.round_body):
+        for _ in range(int(row[k.STEPS])):
+            H, g, figures = _normal_equations(store, poses, use, pairs, place, row, motion, config, beside)
+            if held is not None:
+                _hold(H, held)
+            step = -np.linalg.solve(H + np.diag(1e-6 * np.diag(H) + 1e-9), g).reshape(-1, 6)
+            for i in np.flatnonzero(place >= 0):
+                twist = step[place[i]]
+                size = max(np.linalg.norm(twist[:3]) / 0.03, np.linalg.norm(twist[3:]) / 0.2, 1.0)
+                poses[i] = poses[i] @ k.inverse(k.exponential(twist / size))
+            if np.abs(step[:, :3]).max(initial=0) < 3e-5 and np.abs(step[:, 3:]).max(initial=0) < 3e-4:
+                break
+    return Refined(poses, _covariances(H, place), pairs, figures)
+
+
+def _tied(place: Int[Array, " n"], tied: Int[Array, " n"]) -> Int[Array, " n"]:
+    """Unknowns (-1: none) of views, where those that are tied share theirs."""
+    out = place.copy()
+    for t in np.unique(tied[tied >= 0]):
+        out[tied == t] = out[tied == t].min()
+    left = np.unique(out[out >= 0])
+    return np.where(out >= 0, np.searchsorted(left, out), -1)
+
+
+def _hold(H: Float[Array, "f f"], held: Float[Array, "6"]) -> None:
+    """Takes one twist of the object frame out of every view's freedom."""
+    stiff = 1e3 * np.trace(H) / max(len(H), 1) * np.outer(held, held) / float(held @ held)
+    for a in range(0, len(H), 6):
+        H[a : a + 6, a : a + 6] += stiff
+
+
+def _normal_equations(
+    store: ViewStore, poses: Float[Array, "n 4 4"], use: Bool[Array, " n"], pairs: Int[Array, "m 2"],
+    place: Int[Array, " n"], row: Float[Array, "7"], motion: Motion, config: GraphConfig,
+    beside: Sequence[Terms],
+) -> tuple[Float[Array, "f f"], Float[Array, " f"], Float[Array, "m 3"]]:  # fmt: skip
+    count = int(place.max()) + 1
+    blocks, gradients = np.zeros((len(pairs), 6, 6)), np.zeros((len(pairs), 6))
+    figures = np.zeros((len(pairs), 3))
+    k.graph_terms(
+        poses, pairs, store.maps, store.samples, store.table, store.optics.focal, store.optics.center, row,
+        blocks, gradients, figures,
+    )  # fmt: skip
+    weight = 1.0 / (1.0 + (figures[:, 0] / config.sure_cost) ** 2) / config.shared_noise
+    blocks *= weight[:, None, None]
+    gradients *= weight[:, None]
+    H, g = np.zeros((count, count, 6, 6)), np.zeros((count, 6))
+    add_pairs(H, g, blocks, gradients, place[pairs])
+    _add_motion(H, g, poses, use, place, motion, config)
+    for terms in beside:
+        terms.add(H, g, poses, place)
+    return H.transpose(0, 2, 1, 3).reshape(6 * count, 6 * count), g.reshape(-1), figures
+
+
+def add_pairs(
+    H: Float[Array, "f f 6 6"], g: Float[Array, "f 6"], blocks: Float[Array, "m 6 6"], gradients: Float[Array, "m 6"],
+    places: Int[Array, "m 2"],
+) -> None:  # fmt: skip
+    """Adds terms of pairs of views, given for the twist of each one's first, to normal equations; `places`: each
+    view's unknown, -1 where it is fixed."""
+    i, j = places[:, 0], places[:, 1]
+    for a, b, sign in ((i, i, 1), (j, j, 1), (i, j, -1), (j, i, -1)):
+        ok = (a >= 0) & (b >= 0)
+        np.add.at(H, (a[ok], b[ok]), sign * blocks[ok])
+    np.add.at(g, i[i >= 0], gradients[i >= 0])
+    np.add.at(g, j[j >= 0], -gradients[j >= 0])
+
+
+def _add_motion(
+    H: Float[Array, "f f 6 6"], g: Float[Array, "f 6"], poses: Float[Array, "n 4 4"], use: Bool[Array, " n"],
+    place: Int[Array, " n"], motion: Motion, config: GraphConfig,
+) -> None:  # fmt: skip
+    """Adds the pull towards constant spin and ballistic centre over each three views in a row; impacts are outliers
+    (`_believed`). The residuals are changes of spin (rad/s) and of velocity (m/s), camera axes."""
+    index = np.flatnonzero(use)
+    _add_ties(H, g, poses, index, place, motion, config)
+    if config.jerk_rad_s is not None:
+        _add_smooth(H, g, poses, index, place, motion, config.jerk_rad_s)
+    for a, b, c in zip(index, index[1:], index[2:]):
+        if motion.toss[a] != motion.toss[c] or motion.still[b] or motion.still[c]:
+            continue
+        residual, jacobians = motion_residual((poses[a], poses[b], poses[c]), motion.times_s[[a, b, c]], motion)
+        spin, speed = residual[:3] / config.spin_change_rad_s, residual[3:] / config.velocity_change_m_s
+        w_spin = _believed(spin) / config.spin_change_rad_s**2
+        w_speed = _believed(speed) / config.velocity_change_m_s**2
+        w = np.array([w_spin] * 3 + [w_speed] * 3)
+        for x, jx in zip((a, b, c), jacobians):
+            if place[x] < 0:
+                continue
+            g[place[x]] += jx.T @ (w * residual)
+            for y, jy in zip((a, b, c), jacobians):
+                if place[y] >= 0:
+                    H[place[x], place[y]] += jx.T @ (w[:, None] * jy)
+
+
+def _add_smooth(
+    H: Float[Array, "f f 6 6"], g: Float[Array, "f 6"], poses: Float[Array, "n 4 4"], index: Int[Array, " m"],
+    place: Int[Array, " n"], motion: Motion, sigma_rad_s: float,
+) -> None:  # fmt: skip
+    """Adds the pull towards a steady change of spin over each four views in a row (rad/s, camera axes; `_believed`)."""
+    for four in zip(index, index[1:], index[2:], index[3:]):
+        if len({int(motion.toss[i]) for i in four}) > 1 or motion.still[list(four[1:])].any():
+            continue
+        steps = np.diff(motion.times_s[list(four)])
+        spins = [turn_between(poses[b], poses[a]) / s for a, b, s in zip(four, four[1:], steps)]
+        residual = spins[2] - 2 * spins[1] + spins[0]
+        w = _believed(residual / sigma_rad_s) / sigma_rad_s**2
+        shares = (-1 / steps[0], 1 / steps[0] + 2 / steps[1], -2 / steps[1] - 1 / steps[2], 1 / steps[2])
+        jacobians = [-share * poses[i][:3, :3] for i, share in zip(four, shares)]
+        for x, jx in zip(four, jacobians):
+            if place[x] < 0:
+                continue
+            g[place[x], 3:] += w * jx.T @ residual
+            for y, jy in zip(four, jacobians):
+                if place[y] >= 0:
+                    H[place[x], place[y], 3:, 3:] += w * jx.T @ jy
+
+
+def _believed(normalised: Float[Array, " d"]) -> float:
+    """Weight of a change of motion in standard deviations (Geman-McClure): an impact must not pull at all. A kernel
+    whose pull fades slowly (Cauchy) turns small or blurred objects by tens of degrees where they hit the table."""
+    return float(1.0 / (1.0 + normalised @ normalised / 4.0) ** 2)
+
+
+def _add_ties(
+    H: Float[Array, "f f 6 6"], g: Float[Array, "f 6"], poses: Float[Array, "n 4 4"], index: Int[Array, " m"],
+    place: Int[Array, " n"], motion: Motion, config: GraphConfig,
+) -> None:  # fmt: skip
+    """Ties each pose to the one before it where the object stands still (robustly: Cauchy, because a slow start looks
+    still), or moves as the robot's hand does (Huber: it may slip, but stays in the hand)."""
+    still = np.array([config.still_m**-2] * 3 + [config.still_rad**-2] * 3)
+    carried = np.array([config.carried_m**-2] * 3 + [config.carried_rad**-2] * 3)
+    for a, b in zip(map(int, index), map(int, index[1:])):
+        if motion.toss[a] == motion.toss[b] and motion.still[b]:
+            residual = _gap(poses[a], poses[b])
+            weight = still / (1.0 + residual @ (still * residual) / 9.0)
+        elif is_held(poses, a, b, motion, config):
+            residual = _gap(motion.carried[a, b] @ poses[a], poses[b])
+            weight = carried / max(np.sqrt(residual @ (carried * residual)) / 3.0, 1.0)
+        else:
+            continue
+        _tie(H, g, (int(place[a]), int(place[b])), residual, weight)
+
+
+def is_held(poses: Float[Array, "n 4 4"], a: int, b: int, motion: Motion, config: GraphConfig) -> bool:
+    """Whether the body moves from one view to the next as the robot's hand does."""
+    if (a, b) not in motion.carried:
+        return False
+    off = motion.carried[a, b] @ poses[a] @ k.inverse(poses[b])
+    middle = poses[b][:3, :3] @ motion.center_m + poses[b][:3, 3]
+    turn = np.linalg.norm(rotation_log(off[:3, :3]))
+    return bool(turn < config.held_rad and np.linalg.norm(off[:3, :3] @ middle + off[:3, 3] - middle) < config.held_m)
+
+
+def _gap(one: Float[Array, "4 4"], two: Float[Array, "4 4"]) -> Float[Array, "6"]:
+    """Twist between two poses: that of the first one's view less that of the second's, near the solution."""
+    gap = k.inverse(one) @ two
+    return np.concatenate([gap[:3, 3], rotation_log(gap[:3, :3])])
+
+
+def _tie(
+    H: Float[Array, "f f 6 6"], g: Float[Array, "f 6"], places: tuple[int, int], residual: Float[Array, "6"],
+    weight: Float[Array, "6"],
+) -> None:  # fmt: skip
+    """Adds a `_gap` between two views with these unknowns (-1: fixed)."""
+    a, b = places
+    for x, sign in ((a, 1.0), (b, -1.0)):
+        if x >= 0:
+            g[x] += sign * weight * residual
+            H[x, x] += np.diag(weight)
+    if a >= 0 and b >= 0:
+        H[a, b] -= np.diag(weight)
+        H[b, a] -= np.diag(weight)
+
+
+def motion_residual(
+    three: tuple[Float[Array, "4 4"], Float[Array, "4 4"], Float[Array, "4 4"]],
+    times_s: Float[Array, "3"],
+    motion: Motion,
+) -> tuple[Float[Array, "6"], list[Float[Array, "6 6"]]]:
+    """Change of spin and of velocity over three poses (gravity's share taken off where that is nearer to the truth of
+    a flying body than of a held one), and its derivatives by the three twists, to first order."""
+    steps = np.diff(times_s)
+    spins = [turn_between(three[n + 1], three[n]) / steps[n] for n in (0, 1)]
+    centers = [p[:3, :3] @ motion.center_m + p[:3, 3] for p in three]
+    change = (centers[2] - centers[1]) / steps[1] - (centers[1] - centers[0]) / steps[0]
+    flight = motion.gravity_camera_m_s2 * 0.5 * (steps[0] + steps[1])
+    if np.linalg.norm(change - flight) < np.linalg.norm(change):
+        change = change - flight
+    residual = np.concatenate([spins[1] - spins[0], change])
+    jacobians = []
+    for pose, share in zip(three, (1 / steps[0], -1 / steps[0] - 1 / steps[1], 1 / steps[1])):
+        J = np.zeros((6, 6))
+        J[:3, 3:] = -share * pose[:3, :3]
+        J[3:, :3] = -share * pose[:3, :3]
+        J[3:, 3:] = share * pose[:3, :3] @ skew(motion.center_m)
+        jacobians.append(J)
+    return residual, jacobians
+
+
+def _covariances(H: Float[Array, "d d"], place: Int[Array, " n"]) -> Float[Array, "n 6 6"]:
+    """Each free view's own block of the inverse; zero for the fixed, NaN elsewhere is left to the caller."""
+    out = np.zeros((len(place), 6, 6))
+    inverse = np.linalg.inv(H + 1e-9 * (1 + np.trace(H) / max(len(H), 1)) * np.eye(len(H)))
+    for i in np.flatnonzero(place >= 0):
+        a = 6 * place[i]
+        out[i] = inverse[a : a + 6, a : a + 6]
+    return out

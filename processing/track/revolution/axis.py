@@ -1,0 +1,111 @@
+"""The axis of a round body: the line that the normals of its surface meet."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+from numpy import ndarray as Array
+
+from processing.track import kernels as k
+from processing.track.beam import Scene
+from recordings.geometry import rotation_exp
+
+
+@dataclass(frozen=True)
+class AxisConfig:
+    """When a body may be round; whether it is, its outlines say (profile.py)."""
+
+    round_ratio: float = 0.2
+    """A turn about which depth tells less than this share of what it tells about the next is open ..."""
+    round_share: float = 0.45
+    """... where so many normals meet the axis ..."""
+    round_cells: int = 10
+    """... and point in so many of 36 directions around it (a box's point in four; noisy ones in ten)."""
+    meets: float = 0.1
+    """A normal that passes the axis by less than this share of the body's size meets it."""
+    facing: float = 0.5
+    """Cosine between a normal that is used and its camera."""
+
+
+@dataclass(frozen=True, eq=False)
+class Axis:
+    """A line of the object frame: unit direction, and its point nearest the origin."""
+
+    direction: Float[Array, "3"]
+    point_m: Float[Array, "3"]
+
+    def turn(self, angle_rad: float) -> Float[Array, "4 4"]:
+        """Object points turned about the line."""
+        out = np.eye(4)
+        out[:3, :3] = rotation_exp(self.direction * angle_rad)
+        out[:3, 3] = self.point_m - out[:3, :3] @ self.point_m
+        return out
+
+    def seen_from(self, new_from_old: Float[Array, "4 4"]) -> Axis:
+        """The same line in another object frame."""
+        direction = new_from_old[:3, :3] @ self.direction
+        return Axis(direction, _foot(new_from_old[:3, :3] @ self.point_m + new_from_old[:3, 3], direction))
+
+    @property
+    def twist(self) -> Float[Array, "6"]:
+        """Per radian (translation, rotation)."""
+        return np.concatenate([-np.cross(self.direction, self.point_m), self.direction])
+
+
+def open_axis(scene: Scene, poses: Float[Array, "n 4 4"], use: Bool[Array, " n"], config: AxisConfig) -> Axis | None:
+    """The line that the normals of all frames meet but for a handle's (Pottmann and Wallner 2001, robustly); None
+    where they leave no turn open.
+
+    Minimises over twists (v, d), |d| = 1, the sum of (n . v + (p x n) . d)^2: what a turn moves points along normals.
+    """
+    points, normals = _surface(scene, poses, use, config)
+    middle = np.median(points, axis=0)
+    size = float(np.median(np.linalg.norm(points - middle, axis=1)))
+    lever = np.concatenate([normals, np.cross((points - middle) / size, normals)], axis=1)
+    weight = np.ones(len(points))
+    for _ in range(15):
+        M = (lever * weight[:, None]).T @ lever
+        shift_of = np.linalg.solve(M[:3, :3] + 1e-9 * np.trace(M) * np.eye(3), M[:3, 3:])
+        told, ways = np.linalg.eigh(M[3:, 3:] - M[3:, :3] @ shift_of)
+        direction = ways[:, 0]
+        shift = -shift_of @ direction
+        gap = lever @ np.concatenate([shift, direction])
+        weight = 1.0 / (1.0 + (gap / config.meets) ** 2) ** 2
+    meeting = np.abs(gap) < 2 * config.meets
+    share, cells = float(meeting.mean()), _directions_around(normals[meeting], direction)
+    if told[0] > config.round_ratio * told[1] or share < config.round_share or cells < config.round_cells:
+        return None
+    return Axis(direction, _foot(middle + size * np.cross(direction, shift), direction))
+
+
+def _directions_around(normals: Float[Array, "m 3"], direction: Float[Array, "3"], cells: int = 36) -> int:
+    """How many of the directions around the axis a fair share of the normals has."""
+    side = np.cross(direction, np.eye(3)[int(np.abs(direction).argmin())])
+    side /= np.linalg.norm(side)
+    across = normals[np.abs(normals @ direction) < 0.5]
+    around = np.arctan2(across @ np.cross(direction, side), across @ side)
+    counts = np.bincount(np.floor((around + np.pi) / (2 * np.pi) * cells).astype(int) % cells, minlength=cells)
+    return int((counts > 0.4 * max(len(across), 1) / cells).sum())
+
+
+def _foot(point_m: Float[Array, "3"], direction: Float[Array, "3"]) -> Float[Array, "3"]:
+    return np.asarray(point_m - direction * float(point_m @ direction))
+
+
+def _surface(
+    scene: Scene, poses: Float[Array, "n 4 4"], use: Bool[Array, " n"], config: AxisConfig
+) -> tuple[Float[Array, "m 3"], Float[Array, "m 3"]]:
+    """Points and normals that face their camera well, object frame."""
+    points, normals = [], []
+    for i in np.flatnonzero(use):
+        first, count = int(scene.store.table[i, k.FIRST]), int(scene.store.table[i, k.COUNT])
+        seen = scene.store.samples[first : first + count : 5].astype(np.float64)
+        p, n = seen[:, :3], seen[:, k.SNX : k.SNZ + 1]
+        facing = -np.sum(p * n, 1) / np.linalg.norm(p, axis=1)
+        p, n = p[facing > config.facing], n[facing > config.facing]
+        R = poses[i][:3, :3]
+        points.append((p - poses[i][:3, 3]) @ R)
+        normals.append(n @ R)
+    return np.concatenate(points), np.concatenate(normals)

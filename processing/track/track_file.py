@@ -1,0 +1,77 @@
+"""The default tracker as stages see it: what of a toss's track is kept on disk, and how it comes back."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float
+from numpy import ndarray as Array
+
+from processing.features.sift import Sift
+from processing.motion.motion_prior import gravity_in_camera
+from processing.track.beam import Scene
+from processing.track.depth_color_offset import put_at_color_times
+from processing.track.track_toss import TossTrack, TrackConfig, views_of
+from recordings.errors import BadInput
+from recordings.geometry import CameraModel, Transform
+from recordings.progress import Silent
+from recordings.records import RgbdFrame
+from recordings.results.folder import read_track, write_track
+
+
+def write_toss_track(folder: Path, tracked: TossTrack) -> None:
+    """The track, and beside it what registration needs of how it came about."""
+    write_track(folder, tracked.track)
+    with open(folder / f"toss_{tracked.track.toss:02d}.fit.npz", "wb") as out:
+        np.savez(
+            out,
+            cost=tracked.cost,
+            on_surface=tracked.on_surface,
+            keyframes=np.array(tracked.keyframes, dtype=np.int64),
+            pairs=tracked.pairs,
+            center_m=tracked.center_m,
+            margin=np.array(tracked.margin),
+            round_body=np.array(tracked.round_body),
+            held=tracked.held,
+        )
+
+
+def read_toss_track(
+    folder: Path,
+    toss: int,
+    frames: Sequence[RgbdFrame],
+    masks: Sequence[Bool[Array, "h w"]],
+    camera: CameraModel,
+    confidence: Float[Array, " n"],
+    config: TrackConfig,
+    world_from_camera: Transform | None,
+) -> TossTrack:
+    """A toss's track as `track_toss` gave it, its views cut anew from the frames and depth put where the track's motion
+    has it at colour's exposure. The rejected candidates are gone."""
+    track = read_track(folder, toss)
+    store, times_s, _ = views_of(frames, masks, camera, confidence, config, world_from_camera, Silent())
+    try:
+        with np.load(folder / f"toss_{toss:02d}.fit.npz", allow_pickle=False) as stored:
+            tracked = TossTrack(
+                track=track,
+                cost=stored["cost"],
+                on_surface=stored["on_surface"],
+                keyframes=tuple(int(i) for i in stored["keyframes"]),
+                pairs=stored["pairs"],
+                rejected={},
+                center_m=stored["center_m"],
+                margin=float(stored["margin"]),
+                store=store,
+                round_body=bool(stored["round_body"]),
+                held=stored["held"],
+            )
+    except (OSError, KeyError, ValueError) as wrong:
+        raise BadInput(
+            f"{folder} lacks how toss {toss} was tracked ({wrong}); remove that folder and run again"
+        ) from wrong
+    gravity = gravity_in_camera(None if world_from_camera is None else world_from_camera.matrix)
+    scene = Scene(store, times_s, gravity, tracked.center_m, Sift())
+    put_at_color_times(scene, track.camera_from_object, ~track.lost)
+    return tracked

@@ -1,0 +1,370 @@
+"""Tracks one toss: views, a beam forward, a pass backward over the whole model, one joint refinement, honest flags.
+
+This is the accurate tracker that the pipeline uses by default; `track_toss` is its door.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from numpy import ndarray as Array
+
+from processing.features.sift import FeatureMatcher, Sift
+from processing.motion.motion_prior import gravity_in_camera
+from processing.sensor.photometric_gain import Exposure
+from processing.sensor.rectification import Optics
+from processing.sensor.view import Crop, ViewConfig, ViewStore, cut
+from processing.track import kernels as k
+from processing.track.beam import BeamConfig, Candidate, Hypothesis, Scene, follow, started
+from processing.track.depth_color_offset import unknown_motion
+from processing.track.flags import FlagConfig, doubt, flagged, per_view, unjoined, unjoined_doubt
+from processing.track.hypotheses import Story, StoryConfig, apart_deg, settled
+from processing.track.keyframes import is_new
+from processing.track.known_shape import ShapeConfig, ShapeViews, located, middle_of, shape_views
+from recordings.errors import BadInput
+from recordings.geometry import CameraModel, Transform
+from recordings.progress import Progress, Silent
+from recordings.records import RgbdFrame
+from recordings.tracks import ObjectShape, ObjectTrack
+
+UNFIT_COST = 0.15
+"""Of a frame against those that see the same surface: one rigid body fits better, however it looks."""
+
+
+@dataclass(frozen=True)
+class TrackConfig:
+    """All settings of the tracker, the same for every session; chosen on simulated variety."""
+
+    view: ViewConfig = field(default_factory=ViewConfig)
+    beam: BeamConfig = field(default_factory=BeamConfig)
+    story: StoryConfig = field(default_factory=StoryConfig)
+    flags: FlagConfig = field(default_factory=FlagConfig)
+    shape: ShapeConfig = field(default_factory=ShapeConfig)
+    unheard_deg: float = 20.0
+    """What is told forward is a story of its own where those told backward differ from it by more."""
+    least_confidence: float = 0.2
+    """Frames whose mask is less sure are not looked at."""
+
+
+@dataclass(frozen=True, eq=False)
+class TossTrack:
+    """One toss's track and how it came about.
+
+    `cost` (n): how badly each frame fits the frames that see the same surface, 0 perfect .. 1 (NaN: not tracked);
+    `on_surface` (n): share of its points on their surface; `keyframes`: positions of the views that span the object;
+    `pairs` (m, 2) compared in the joint refinement; `rejected`: candidates (camera_from_object 4x4) per position;
+    `center_m`: estimated middle of mass in the object frame; `store`: the views, for registration between tosses.
+    """
+
+    track: ObjectTrack
+    cost: Float[Array, " n"]
+    on_surface: Float[Array, " n"]
+    keyframes: tuple[int, ...]
+    pairs: Int[Array, "m 2"]
+    rejected: dict[int, list[Candidate]]
+    center_m: Float[Array, "3"]
+    margin: float
+    """How much worse the best different story fits (infinite: there is none)."""
+    store: ViewStore
+    held: Int[Array, " n"]
+    """Frames with the same number are a run through which a robot's hand carries the body; -1: none does."""
+    round_body: bool = False
+    """Whether the body is round and its turn was found from all frames at once: pairs of views alone would spoil it."""
+
+    @property
+    def tied(self) -> Int[Array, " n"]:
+        """Frames with the same number lie to each other as they do; -1: to no others."""
+        return np.zeros_like(self.held) if self.round_body else self.held
+
+    @property
+    def unfit(self) -> int:
+        """Frames that no pose fits: where they are many, the masks do not show one rigid body."""
+        return int(np.sum(~self.fits))
+
+    @property
+    def fits(self) -> Bool[Array, " n"]:
+        """Whether a pose explains what each looked-at frame shows (frames that show nothing count as fitting)."""
+        seen = np.array([self.store.usable(i) for i in range(len(self.cost))], dtype=bool)
+        return ~seen | (self.cost < UNFIT_COST)
+
+
+@dataclass(frozen=True, eq=False)
+class _Known:
+    """What is known before tracking. Poses are camera_from_object (4x4, NaN where unknown)."""
+
+    start: Float[Array, "4 4"] | None
+    start_frame: int | None
+    poses: Float[Array, "n 4 4"] | None
+    model: ShapeViews | None
+
+
+def track_toss(
+    frames: Sequence[RgbdFrame],
+    masks: Sequence[Bool[Array, "h w"]],
+    camera: CameraModel,
+    config: TrackConfig | None = None,
+    progress: Progress | None = None,
+    *,
+    toss: int = 0,
+    object_frame: str = "object",
+    confidence: Float[Array, " n"] | None = None,
+    world_from_camera: Transform | None = None,
+    start: Transform | None = None,
+    start_frame: int | None = None,
+    poses: Float[Array, "n 4 4"] | None = None,
+    model: ObjectShape | None = None,
+    colorless: Sequence[Bool[Array, "h w"]] | None = None,
+    matcher: FeatureMatcher | None = None,
+    hand: Float[Array, "n 4 4"] | None = None,
+) -> TossTrack:
+    """Poses `camera_from_object` of all colour frames of one toss, without a model of the object unless one is given.
+
+    masks: the object's visible pixels in each colour frame; confidence: how sure each is (0..1); colorless: pixels of
+    the masks that show something else's colour (an occluder before depth that was drawn). world_from_camera tells
+    gravity and the table (z = 0); hand: camera_from_hand of a robot that may hold the object (NaN where it does not).
+
+    The object frame is parallel to the camera at the first usable frame, its origin at the middle of the cloud seen
+    there; or `start` gives camera_from_object of frame `start_frame` (None: the first usable one), which is kept.
+    `poses` (NaN where unknown) are refined, only unknown frames are sought. With `model` the object frame is the
+    model's: the object is located anew in the first frame (or starts from `start` or `poses`), then tracked against
+    the model's surface and colours and what the frames themselves show.
+    Raises BadInput where no frame shows enough of the object, or where what is given does not fit together.
+    """
+    config, progress = config or TrackConfig(), progress or Silent()
+    if hand is not None and hand.shape != (len(frames), 4, 4):
+        raise BadInput(f"a hand of shape {hand.shape} for {len(frames)} frames; wanted a 4x4 pose per frame, or NaN")
+    sure = np.ones(len(frames)) if confidence is None else np.asarray(confidence, dtype=np.float64)
+    store, times_s, drawn = views_of(
+        frames, masks, camera, sure, config, world_from_camera, progress, colorless=colorless, model=model
+    )
+    known = _known(start, start_frame, poses, drawn, len(frames))
+    first = _first(store, known, len(frames), toss, config)
+    world = None if world_from_camera is None else world_from_camera.matrix
+    middle = _middle(store, first, known) if model is None else middle_of(model)
+    scene = Scene(store, times_s, gravity_in_camera(world), middle, matcher or Sift(), hand=hand)
+    if known.poses is None:
+        stories, margin, rejected = _followed(scene, first, known, config, progress)
+    else:
+        story, margin, rejected = _filled_in(scene, known, config, progress)
+        stories = [story]
+    keep_first = model is None or known.start is not None
+    joint = settled(scene, stories, first, keep_first, config.story)
+    frame = object_frame if model is None else model.object_frame
+    return _told(scene, joint, first, margin, rejected, config, toss, camera.frame, frame, frames)
+
+
+def _known(
+    start: Transform | None, start_frame: int | None, poses: Float[Array, "n 4 4"] | None, drawn: ShapeViews | None,
+    count: int,
+) -> _Known:  # fmt: skip
+    """What was given, checked."""
+    if poses is not None and start is not None:
+        raise BadInput("both a start and poses of all frames were given; wanted one of them")
+    if poses is not None and poses.shape != (count, 4, 4):
+        raise BadInput(f"poses of shape {poses.shape} for {count} frames; wanted ({count}, 4, 4), NaN where unknown")
+    if start_frame is not None and (start is None or not 0 <= start_frame < count):
+        raise BadInput(f"start_frame {start_frame} of {count} frames; wanted a frame's position, together with a start")
+    return _Known(None if start is None else start.matrix, start_frame, poses, drawn)
+
+
+def _first(store: ViewStore, known: _Known, count: int, toss: int, config: TrackConfig) -> int:
+    """The frame that tracking starts from."""
+    usable = [i for i in range(count) if store.usable(i)]
+    if not usable:
+        raise BadInput(
+            f"toss {toss}: no frame shows the object: every mask is empty or has no depth; wanted at least "
+            f"{config.view.least_samples} mask pixels with depth: look at the masks with `toss-view`, give a first mask"
+        )
+    if known.poses is not None:
+        posed = [i for i in usable if np.isfinite(known.poses[i]).all()]
+        if not posed:
+            raise BadInput(f"toss {toss}: none of the {len(usable)} usable frames has one of the given poses")
+        return posed[0]
+    if known.start_frame is not None and known.start_frame not in usable:
+        raise BadInput(f"toss {toss}: frame {known.start_frame}, whose pose is given, does not show the object")
+    return usable[0] if known.start_frame is None else known.start_frame
+
+
+def views_of(
+    frames: Sequence[RgbdFrame], masks: Sequence[Bool[Array, "h w"]], camera: CameraModel, sure: Float[Array, " n"],
+    config: TrackConfig, world_from_camera: Transform | None, progress: Progress,
+    colorless: Sequence[Bool[Array, "h w"]] | None = None, model: ObjectShape | None = None,
+) -> tuple[ViewStore, Float[Array, " n"], ShapeViews | None]:  # fmt: skip
+    """All frames as views (depth taken as if exposed with colour), and colour times since the first, seconds; after
+    them in the store the views of a model, where there is one, and their poses."""
+    if len(frames) != len(masks) or len(frames) != len(sure):
+        raise BadInput(
+            f"{len(frames)} frames, {len(masks)} masks and {len(sure)} confidences; wanted one each per frame"
+        )
+    if len(frames) == 0:
+        raise BadInput("a toss without frames; wanted at least one colour and depth frame")
+    if colorless is not None and len(colorless) != len(frames):
+        raise BadInput(f"{len(frames)} frames and {len(colorless)} masks of colourless pixels; wanted one per frame")
+    optics, exposure = Optics.of(camera), Exposure()
+    camera_from_world = None if world_from_camera is None else world_from_camera.inverse().matrix
+    crops: list[Crop | None] = []
+    times_ns = []
+    for i, frame in enumerate(frames):
+        mask = np.asarray(masks[i], dtype=bool)
+        gain = exposure.gain(frame.color_rgb, mask)
+        foreign = None if colorless is None or not colorless[i].any() else np.asarray(colorless[i], dtype=bool)
+        seen = sure[i] >= config.least_confidence
+        crops.append(cut(frame, mask, i, optics, gain, config.view, camera_from_world, foreign) if seen else None)
+        times_ns.append(frame.time_ns)
+        progress.step(i + 1, 3 * len(frames), "views")
+    drawn = None if model is None else shape_views(model, crops, optics, config.shape)
+    store = ViewStore(optics, [*crops, *(drawn.crops if drawn else ())], config.view)
+    for i in range(len(store)):
+        store.fill(i)
+    return store, (np.array(times_ns) - times_ns[0]) * 1e-9, drawn
+
+
+def first_pose(store: ViewStore, view: int) -> Float[Array, "4 4"]:
+    """Parallel to the camera, at the middle of the cloud."""
+    first, count = int(store.table[view, k.FIRST]), int(store.table[view, k.COUNT])
+    pose = np.eye(4)
+    pose[:3, 3] = store.samples[first : first + count, :3].mean(0)
+    return pose
+
+
+def _middle(store: ViewStore, view: int, known: _Known) -> Float[Array, "3"]:
+    """Where the body's middle lies in the object frame: behind the cloud's middle by a third of its width."""
+    first, count = int(store.table[view, k.FIRST]), int(store.table[view, k.COUNT])
+    points = store.samples[first : first + count, :3].astype(np.float64)
+    middle = points.mean(0)
+    width = float(np.ptp(points[:, :2], axis=0).mean())
+    behind = np.asarray(middle / np.linalg.norm(middle) * width * 0.3)
+    pose = known.start if known.poses is None else known.poses[view]
+    if pose is None:
+        return behind
+    return np.asarray(pose[:3, :3].T @ (middle + behind - pose[:3, 3]))
+
+
+def _followed(
+    scene: Scene, first: int, known: _Known, config: TrackConfig, progress: Progress
+) -> tuple[list[Hypothesis], float, dict[int, list[Candidate]]]:
+    """Stories of the same frames: the beam forward, then once more backward with all that forward learned as the
+    model; a beam backward that knows nothing of the first but where the last frame is; and the beam forward itself,
+    where both backward say something else."""
+    n = len(scene.times_s)
+
+    def told(i: int, beam: list[Hypothesis]) -> None:
+        progress.step(n + i, 3 * n, "forward")
+
+    beam, wide = _starts(scene, first, known, config)
+    ahead = follow(scene, np.arange(first + 1, n), beam, wide, told)
+    best = ahead.best
+    last = best.tracked[-1]
+    told_all = replace(best, done=(last,), total=0.0)
+    stop = first if known.model is None or known.start is not None else first - 1
+    narrow = replace(config.beam, width=2)
+    stories = [follow(scene, np.arange(last - 1, stop, -1), [told_all], narrow).best]
+    if known.model is None and last > first + 1:
+        fresh = started(scene.store, n, last, best.poses[last])
+        stories.append(_anchored(follow(scene, np.arange(last - 1, first - 1, -1), [fresh], narrow).best, best, first))
+        if all(apart_deg(best.poses[:n], s.poses[:n]) > config.unheard_deg for s in stories):
+            stories.append(best)
+    out = []
+    for story in stories:
+        if any(scene.store.usable(i) for i in range(first)):
+            done = (*(i for i in story.done if i != first), first)
+            story = follow(scene, np.arange(first - 1, -1, -1), [replace(story, done=done)], narrow).best
+        out.append(replace(story, done=tuple(range(n)), total=best.total))
+    return out, ahead.margin, ahead.rejected
+
+
+def _anchored(story: Hypothesis, other: Hypothesis, first: int) -> Hypothesis:
+    """The story in the object frame in which the first frame's pose is that of the other story."""
+    if not np.isfinite(story.poses[first, 0, 0]):
+        return story
+    own_from_other = np.linalg.inv(story.poses[first]) @ other.poses[first]
+    poses = story.poses @ own_from_other
+    poses[first] = other.poses[first]
+    return replace(story, poses=poses)
+
+
+def _starts(scene: Scene, first: int, known: _Known, config: TrackConfig) -> tuple[list[Hypothesis], BeamConfig]:
+    """The hypotheses that tracking starts from, and how many are carried."""
+    n = len(scene.times_s)
+    if known.model is None:
+        pose = first_pose(scene.store, first) if known.start is None else known.start
+        return [started(scene.store, n, first, pose)], config.beam
+    if known.start is not None:
+        return [_with_model(started(scene.store, n, first, known.start), known.model)], config.beam
+    wide = replace(config.beam, width=max(config.beam.width, config.shape.starts))
+    beam = []
+    for found in located(scene, first, known.model, config.beam, config.shape):
+        h = _with_model(started(scene.store, n, first, found.pose), known.model)
+        beam.append(replace(h, total=found.fit))
+    if not beam:
+        raise BadInput("the given shape fits nothing that the first frame shows; is it a shape of this object?")
+    return beam, wide
+
+
+def _with_model(h: Hypothesis, model: ShapeViews) -> Hypothesis:
+    """The hypothesis with the model's views (after the frames') among its keyframes."""
+    n, m = len(h.costs), len(model.poses)
+    keys = (*range(n, n + m), *h.keyframes)
+    return replace(h, poses=np.concatenate([h.poses, model.poses]), keyframes=keys)
+
+
+def _filled_in(
+    scene: Scene, known: _Known, config: TrackConfig, progress: Progress
+) -> tuple[Hypothesis, float, dict[int, list[Candidate]]]:
+    """The given poses as one hypothesis; usable frames without one are sought from the known frames around them."""
+    assert known.poses is not None
+    n = len(scene.times_s)
+    given = [i for i in range(n) if scene.store.usable(i) and np.isfinite(known.poses[i]).all()]
+    poses = np.full((n, 4, 4), np.nan)
+    poses[given] = known.poses[given]
+    h = Hypothesis(poses, np.full(n, np.nan), np.full(n, np.nan), tuple(given), (given[0],), 0.0)
+    if known.model is not None:
+        h = _with_model(h, known.model)
+    for i in given[1:]:
+        if is_new(h.poses, i, h.keyframes, scene.center_m, config.beam.keyframes):
+            h = replace(h, keyframes=(*h.keyframes, i))
+    rejected: dict[int, list[Candidate]] = {}
+    for i in range(n):
+        if i in given or not scene.store.usable(i):
+            continue
+        posed = np.flatnonzero(np.isfinite(h.poses[:n, 0, 0]))
+        around = posed[posed < i] if (posed < i).any() else posed[::-1]
+        found = follow(scene, np.array([i]), [replace(h, done=tuple(int(j) for j in around))], config.beam)
+        h, rejected = found.best, {**rejected, **found.rejected}
+        progress.step(n + i, 3 * n, "frames without a pose")
+    return replace(h, done=tuple(range(n))), np.inf, rejected
+
+
+def _told(
+    scene: Scene, stories: list[Story], first: int, margin: float, rejected: dict[int, list[Candidate]],
+    config: TrackConfig, toss: int, camera: str, object_frame: str, frames: Sequence[RgbdFrame],
+) -> TossTrack:  # fmt: skip
+    """The best story with honest flags."""
+    n, best = len(scene.times_s), stories[0]
+    joint = best.joint
+    cost, on = (figure[:n] for figure in per_view(joint.pairs, joint.figures, len(scene.store)))
+    lost = ~best.use | (cost > config.flags.tracked_cost)
+    lost[first] &= not best.fixed[first]
+    twists = config.flags.correlated * joint.covariance[:n]
+    if best.turned is not None:
+        twist = best.turned.axis.twist
+        twists = twists + best.turned.sigma_rad[:, None, None] ** 2 * np.outer(twist, twist)
+    for other in stories[1:]:
+        apart = other.total - best.total
+        twists = twists + doubt(joint.poses[:n], other.joint.poses[:n], apart, config.flags)
+    twists = twists + unknown_motion(scene, joint.poses[:n], best.use)
+    hanging = unjoined(joint.pairs, joint.figures, (first, *range(n, len(scene.store))), best.use & ~lost, config.flags)
+    twists = twists + unjoined_doubt(hanging, best.center_m, config.flags)
+    poses, status, covariance = flagged(joint.poses[:n], twists, lost, scene, config.flags)
+    times_ns = np.array([f.time_ns for f in frames], dtype=np.int64)
+    track = ObjectTrack(toss, camera, object_frame, times_ns, poses, status, covariance)
+    keyframes = tuple(i for i in sorted(best.told.keyframes) if i < n and not lost[i])
+    pairs = joint.pairs[(joint.pairs < n).all(1)]
+    for other in stories[1:]:
+        if apart_deg(joint.poses[:n], other.joint.poses[:n]) > config.story.agreeing_deg:
+            margin = min(margin, other.total - best.total)
+    return TossTrack(track, cost, on, keyframes, pairs, rejected, best.center_m, margin, scene.store,
+                     best.held, best.axis is not None)  # fmt: skip
