@@ -19,9 +19,10 @@ from acquisition.arm.throw import Thrower
 from acquisition.interrupts import Interrupts
 from acquisition.operator import Keyboard, Nobody, Operator, Unattended, single_keys
 from acquisition.preflight import Preflight, of_recording, preflight
+from acquisition.ready_rig import Setup
 from acquisition.rig import Rig
 from acquisition.run import Options, SessionReport, SessionRun
-from acquisition.setup import Setup, set_up
+from acquisition.setup import set_up
 from acquisition.streaming.clock import SessionClock
 from acquisition.streaming.recorder import Recorder
 from recordings.console import DONE, FELL_SHORT, Outcome, progress_for

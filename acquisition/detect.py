@@ -16,10 +16,10 @@ from jaxtyping import Bool, Float, UInt16
 from numpy import ndarray as Array
 
 from acquisition.arm.limits import ArmModel
+from recordings.constants import GRAVITY_M_S2
 from recordings.geometry import CameraModel, Transform
 from recordings.records import TossEvent
 
-GRAVITY_M_S2 = 9.81
 TABLE_M = 0.008
 """Points lower than this belong to the table."""
 HIGHEST_M = 1.2

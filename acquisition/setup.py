@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from acquisition.arm.throw import ByHand, Thrower
+from acquisition.arm.throw import ByHand
 from acquisition.devices import Device
+from acquisition.ready_rig import Setup
 from acquisition.rig import DeviceEntry, Rig, find_rig, from_table, read_rig
 from recordings.errors import BadInput
 from recordings.tracks import RigCalibration
 
 if TYPE_CHECKING:
-    from acquisition.drivers.synthetic import SyntheticLab
+    pass
 
 REPLAY = "replay:"
 CLASSES: Mapping[str, tuple[str, str, str]] = {
@@ -27,25 +27,6 @@ CLASSES: Mapping[str, tuple[str, str, str]] = {
 }
 """Driver -> module, class, dataclass of its settings."""
 NO_CALIBRATION = RigCalibration(cameras={})
-
-
-@dataclass(eq=False)
-class Setup:
-    """A rig ready to be opened. `lab` is the simulation, where there is one."""
-
-    rig: Rig
-    devices: dict[str, Device]
-    thrower: Thrower
-    calibration: RigCalibration
-    lab: SyntheticLab | None = None
-    live: bool = True
-    """False: a recording, which has nothing to say before it is played."""
-
-    @property
-    def moves_arm(self) -> bool:
-        """Whether tosses move a real arm."""
-        rig = self.rig
-        return self.lab is None and self.live and bool(rig.toss and rig.robot and rig.of_kind("arm"))
 
 
 def set_up(name: str) -> Setup:
@@ -62,7 +43,8 @@ def set_up(name: str) -> Setup:
 
 
 def _synthetic(rig: Rig) -> Setup:
-    from acquisition.drivers.synthetic import SyntheticConfig, SyntheticLab, SyntheticThrower
+    from acquisition.drivers.synthetic import SyntheticLab, SyntheticThrower
+    from acquisition.synthetic.lab_config import SyntheticConfig
 
     config = from_table(SyntheticConfig, rig.simulation, f"{rig.source}: [simulation]")
     lab = SyntheticLab(config)

@@ -16,8 +16,8 @@ from acquisition.devices import Image
 from acquisition.interrupts import Interrupts
 from acquisition.operator import Operator
 from acquisition.preflight import of_one_size
+from acquisition.ready_rig import Setup
 from acquisition.run import SessionReport
-from acquisition.setup import Setup
 from acquisition.streaming.recorder import Recorder
 from acquisition.synthetic.board import board_tags
 from calibration.cameras.targets import Target, TargetView, find_target, target_from_document

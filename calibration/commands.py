@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -16,10 +15,11 @@ from calibration import store
 from calibration.cameras.extrinsics import PlacedCameras, calibrate_cameras
 from calibration.cameras.intrinsics import Lens, as_good_alone, calibrate_intrinsics
 from calibration.cameras.targets import Tags, TargetView
+from calibration.done import TOOL, Done, done
 from calibration.drift import bumps
 from calibration.hand_eye import calibrate_hand_eye
 from calibration.pictures import residual_picture
-from calibration.report import Finding, Report
+from calibration.report import Finding
 from calibration.tags.faults import explain_absence
 from calibration.views import (
     COLOR,
@@ -38,34 +38,7 @@ from recordings.robot.arm import ArmPath, panda
 from recordings.session import Session, Toss
 
 DEPTH_SIZE_OFF, DEPTH_SIZE_WRONG = 0.02, 0.05
-TOOL = "panda_hand_tcp"
 LENSES: tuple[DistortionModel, ...] = ("none", "brown-conrady", "rational")
-
-
-@dataclass(frozen=True)
-class Done:
-    """What a command did. `refused`: calibration.json stayed as it was."""
-
-    document: Mapping[str, Any]
-    text: str
-    refused: bool
-
-
-def done(reports: Sequence[Report], written: Path | None, pictures: Sequence[Path], asked: bool) -> Done:
-    """`asked`: somebody wanted it written (no --dry-run)."""
-    refused = any(r.verdict == "refused" for r in reports)
-    if written is not None:
-        last = f"written: {written}"
-    else:
-        last = "refused: calibration.json stays as it was" if refused and asked else "nothing was written"
-    document = {
-        "calibrations": [{"kind": r.kind, **r.to_json()} for r in reports],
-        "verdict": "refused" if refused else "doubtful" if any(r.verdict != "good" for r in reports) else "good",
-        "written": None if written is None else str(written),
-        "pictures": [str(p) for p in pictures],
-    }
-    lines = [r.text() for r in reports] + [f"picture: {p}" for p in pictures] + [last]
-    return Done(document, "\n".join(lines), refused)
 
 
 def intrinsics(path: Path, args: argparse.Namespace, progress: Progress) -> Done:

@@ -15,7 +15,7 @@ from calibration import store
 from calibration.cameras.extrinsics import still_view
 from calibration.cameras.poses import inverse_poses
 from calibration.cameras.targets import Tags, TargetView, tag_view
-from calibration.commands import Done, done
+from calibration.done import Done, done
 from calibration.ground_plane import (
     Gravity,
     Plane,

@@ -14,7 +14,7 @@ from calibration import store
 from calibration.cameras.extrinsics import spread
 from calibration.cameras.poses import inverse_poses
 from calibration.cameras.targets import Tags, tag_view
-from calibration.commands import TOOL, Done, done
+from calibration.done import TOOL, Done, done
 from calibration.pictures import offsets_picture, residual_picture
 from calibration.report import Finding, Report, limit
 from calibration.tags.tagged_object import TaggedObject, solve_tagged_object

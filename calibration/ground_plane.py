@@ -24,7 +24,8 @@ from calibration.cameras.pnp import poses_of_points
 from calibration.cameras.poses import inverse_poses
 from calibration.cameras.targets import TargetView
 from calibration.report import Finding, Report, limit
-from calibration.time_offset import GRAVITY_M_S2, Path3
+from calibration.time_offset import Path3
+from recordings.constants import GRAVITY_M_S2, MAD_TO_SIGMA
 from recordings.errors import BadInput
 from recordings.geometry import CameraModel, Transform
 
@@ -190,7 +191,7 @@ def _left_over(
         out["tags_rms_mm"] = 1e3 * float(np.sqrt(((plane.heights_m(tags[0]) - tag_height_m) ** 2).mean()))
     if depth is not None:
         heights = plane.heights_m(depth / (scale or 1.0))
-        out["depth_spread_mm"] = 1e3 * 1.4826 * float(np.median(np.abs(heights - np.median(heights))))
+        out["depth_spread_mm"] = 1e3 * MAD_TO_SIGMA * float(np.median(np.abs(heights - np.median(heights))))
         if tags is not None:
             raw = plane.heights_m(depth)
             out["depth_before_scaling_mm"] = 1e3 * float(np.median(raw))
@@ -218,7 +219,7 @@ def table_points(
         if len(close) < 100:
             raise BadInput("no table in the depth image where the calibration says it is; run `toss-calibrate cameras`")
         plane = _start(None, close)
-        width = max(3.0 * 1.4826 * float(np.median(np.abs(plane.heights_m(close)))), 0.003)
+        width = max(3.0 * MAD_TO_SIGMA * float(np.median(np.abs(plane.heights_m(close)))), 0.003)
     return close
 
 

@@ -25,6 +25,7 @@ from calibration.cameras.targets import TargetView
 from calibration.report import Finding, Report, limit
 from recordings.errors import BadInput
 from recordings.geometry import CameraModel
+from recordings.robust import huber_cost, huber_weight
 
 Mounting = Literal["eye-to-hand", "eye-in-hand"]
 LEAST_POSES, GOOD_POSES = 5, 15
@@ -313,8 +314,8 @@ def _gauss_newton(residuals: Callable[[Array], Array], numbers: Array, owner: Ar
     trial = numbers
     for _ in range(STEPS):
         plain = residuals(trial)
-        weight = np.sqrt(np.minimum(1.0, HUBER / np.maximum(np.abs(plain), 1e-12)))
-        cost = float(np.where(np.abs(plain) <= HUBER, plain**2, HUBER * (2 * np.abs(plain) - HUBER)).sum())
+        weight = np.sqrt(huber_weight(np.abs(plain), HUBER))
+        cost = 2 * float(huber_cost(np.abs(plain), HUBER).sum())
         if cost < best:
             gain, best, numbers, damping = best - cost, cost, trial, max(damping / 10, 1e-9)
             left = weight * plain

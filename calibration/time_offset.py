@@ -21,12 +21,13 @@ from calibration.cameras.pnp import most_agreed, poses_of_points
 from calibration.cameras.poses import exp_poses
 from calibration.cameras.targets import TargetView
 from calibration.report import Finding, Report, limit
+from recordings.constants import GRAVITY_M_S2, MAD_TO_SIGMA
 from recordings.errors import BadInput
 from recordings.geometry import CameraModel
+from recordings.robust import huber_weight
 
 GOOD_MS, WORST_MS = 1.0, 5.0
 LEAST_SPEED_M_S = 0.15
-GRAVITY_M_S2 = 9.81
 JERKY_M_S2 = 20.0
 """Accelerations further than this from both rest and free fall belong to an impact."""
 SEARCH_S, SEARCHED = 0.1, 15
@@ -242,8 +243,8 @@ def _system(
     J = np.stack(
         [(residual(numbers + s * np.eye(len(numbers))[k])[used].ravel() - here) / s for k, s in enumerate(steps)], -1
     )
-    scale = max(1.4826 * float(np.median(np.abs(here))), 1e-9)
-    weight = np.sqrt(np.minimum(1.0, HUBER * scale / np.maximum(np.abs(here), 1e-12))) / scale
+    scale = max(MAD_TO_SIGMA * float(np.median(np.abs(here))), 1e-9)
+    weight = np.sqrt(huber_weight(np.abs(here), HUBER * scale)) / scale
     rows = np.hstack([np.zeros((len(prior), 1)), np.diag(prior)])
     return np.vstack([weight[:, None] * J, rows]), np.concatenate([weight * here, prior * numbers[1:]]), scale
 

@@ -139,7 +139,7 @@ def _layout(path: Path) -> tuple[dict[int, float], dict[int, Any]]:
     """Sizes and tagged_from_tag by id."""
     import numpy as np
 
-    from recordings.documents import read_json
+    from recordings.bounded.documents import read_json
     from recordings.geometry import Transform
 
     try:

@@ -24,6 +24,7 @@ from groundtruth.toss_truth import MOMENT_S, TossTruth, TrackedLimits, statuses
 from recordings.geometry import CameraModel
 from recordings.mcap.codec import decode_image
 from recordings.progress import Progress
+from recordings.robust import huber_weight
 from recordings.session import Session
 
 CAMERA = "d455"
@@ -236,7 +237,7 @@ def _placed(
         residual = model.project(inside) - pixels - off[6] * outwards
         size = np.linalg.norm(residual, axis=1) / sigma
         noise = max(1.0, float(np.median(size)) / 1.177)  # the median of a two-dimensional normal's length
-        root = np.sqrt(np.minimum(1.0, config.huber / np.maximum(size / noise, 1e-9))) / (sigma * noise)
+        root = np.sqrt(huber_weight(size / noise, config.huber)) / (sigma * noise)
         arm = np.concatenate([-se3.skew(inside), np.broadcast_to(np.eye(3), (len(inside), 3, 3))], -1)
         by_point = _by_point(model, inside)
         by_time = by_point @ (speed @ camera[:3, :3].T)[..., None]
@@ -311,7 +312,7 @@ def _fused(
             return None
         residual = model.project(inside) - pixels
         size = np.linalg.norm(residual, axis=1) / sigma
-        root = np.sqrt(np.minimum(1.0, config.huber / np.maximum(size, 1e-9))) / sigma
+        root = np.sqrt(huber_weight(size, config.huber)) / sigma
         by_pose = np.concatenate([-se3.skew(arm), np.broadcast_to(np.eye(3), (len(arm), 3, 3))], -1)
         J = _by_point(model, inside) @ place.camera_from_world[:3, :3] @ by_pose * root[:, None, None]
         information = np.einsum("nij,nik->jk", J, J) + prior

@@ -11,7 +11,8 @@ from numpy import ndarray as Array
 
 from groundtruth import se3
 from groundtruth.factors import Arc
-from groundtruth.interpolate import GRAVITY_M_S2
+from groundtruth.interpolate import GRAVITY_WORLD_M_S2
+from recordings.robust import geman_mcclure_weight
 
 Order = Mapping[int, tuple[Array, Array]]
 """Per toss: times (ns) and the numbers of the body's poses at them."""
@@ -43,7 +44,7 @@ def center_of_mass(
             shares[1] = -shares.sum()
             three = poses[numbers[k - 1 : k + 2]]
             rows.append(np.einsum("i,ijk->jk", shares, three[:, :3, :3]))
-            values.append(GRAVITY_M_S2 - shares @ three[:, :3, 3])
+            values.append(GRAVITY_WORLD_M_S2 - shares @ three[:, :3, 3])
     center = middle
     if not rows:
         return center
@@ -67,12 +68,14 @@ def arcs_of(poses: Float[Array, "n 4 4"], order: Order, center: Float[Array, "3"
                 continue
             three = (int(numbers[k - 1]), int(numbers[k]), int(numbers[k + 1]))
             fall, turn = _off_arc(poses, three, (float(h[k - 1]), float(h[k])), center)
-            weight = 1 / (1 + (fall / (3 * config.fall_m_s2)) ** 2) ** 2
-            turn_weight = 1 / (1 + (turn / (3 * config.turn_rad_s2)) ** 2) ** 2
+            weight = geman_mcclure_weight((fall / (3 * config.fall_m_s2)) ** 2)
+            turn_weight = geman_mcclure_weight((turn / (3 * config.turn_rad_s2)) ** 2)
             both = min(weight, turn_weight)
             if both > 0.02:
                 steps = (float(h[k - 1]), float(h[k]))
-                arcs.append(Arc(three, steps, center, GRAVITY_M_S2, config.fall_m_s2, config.turn_rad_s2, both, both))
+                arcs.append(
+                    Arc(three, steps, center, GRAVITY_WORLD_M_S2, config.fall_m_s2, config.turn_rad_s2, both, both)
+                )
     return arcs
 
 
@@ -84,5 +87,5 @@ def _off_arc(
     R = poses[list(three), :3, :3]
     spins = se3.log(se3.rotations(np.swapaxes(R[:2], -1, -2) @ R[1:]))[:, :3] / np.array(h)[:, None]
     acceleration = 2 * ((x[2] - x[1]) / h[1] - (x[1] - x[0]) / h[0]) / sum(h)
-    fall = float(np.linalg.norm(acceleration - GRAVITY_M_S2))
+    fall = float(np.linalg.norm(acceleration - GRAVITY_WORLD_M_S2))
     return fall, float(np.linalg.norm(spins[1] - spins[0])) * 2 / sum(h)

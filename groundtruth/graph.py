@@ -40,6 +40,7 @@ from groundtruth.factors import (
 )
 from recordings.errors import TosslabError
 from recordings.geometry import CameraModel
+from recordings.robust import huber_cost, huber_weight
 
 
 class Undetermined(TosslabError):
@@ -298,9 +299,7 @@ class _System:
         k = self._config.huber_px
         if k is None:
             return 0.5 * scaled**2, np.ones_like(scaled)
-        far = scaled > k
-        cost = np.where(far, k * scaled - 0.5 * k * k, 0.5 * scaled**2)
-        return cost, np.where(far, k / np.maximum(scaled, 1e-12), 1.0)
+        return huber_cost(scaled, k), huber_weight(scaled, k)
 
     def _others(self, poses: Float[Array, "n 4 4"]) -> list[tuple[Array, list[Array], Int[Array, "m k"]]]:
         """Whitened residuals (m, d), Jacobians (m, d, 6) by pose, and the poses' indices, of all other factors."""

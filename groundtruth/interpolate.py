@@ -20,8 +20,10 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray as Array
 from scipy.spatial.transform import Rotation
 
+from recordings.constants import GRAVITY_M_S2
+
 Kind = Literal["ballistic", "smooth", "impact"]
-GRAVITY_M_S2 = np.array([0.0, 0.0, -9.81])
+GRAVITY_WORLD_M_S2 = np.array([0.0, 0.0, -GRAVITY_M_S2])
 
 
 @dataclass(frozen=True)
@@ -162,7 +164,7 @@ def _arc(motion: Motion, k: int, t: float) -> Float[Array, "4 4"]:
     """The arc through poses k and k+1, also outside their interval."""
     a, b = motion.time_s[k], motion.time_s[k + 1]
     u = (t - a) / (b - a)
-    x = (1 - u) * _center(motion, k) + u * _center(motion, k + 1) - 0.5 * GRAVITY_M_S2 * (t - a) * (b - t)
+    x = (1 - u) * _center(motion, k) + u * _center(motion, k + 1) - 0.5 * GRAVITY_WORLD_M_S2 * (t - a) * (b - t)
     turn = _turns(motion.poses[k : k + 2])[0]
     return _pose(motion, motion.poses[k, :3, :3] @ Rotation.from_rotvec(u * turn).as_matrix(), x)
 
@@ -188,7 +190,7 @@ def _slope(motion: Motion, inside: int, beside: int) -> tuple[Float[Array, "3"],
     other_v, other_w = _rates(motion, beside)
     if motion.kinds[beside] == "ballistic":
         sign = 0.5 if beside < inside else -0.5
-        return other_v + sign * h[beside] * GRAVITY_M_S2, other_w
+        return other_v + sign * h[beside] * GRAVITY_WORLD_M_S2, other_w
     share = h[beside] / (h[beside] + h[inside])
     return share * v + (1 - share) * other_v, share * w + (1 - share) * other_w
 

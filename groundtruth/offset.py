@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 from numpy import ndarray as Array
 from scipy.spatial.transform import Rotation
 
-from recordings.documents import read_json
+from recordings.bounded.documents import read_json
 from recordings.errors import BadInput
 from recordings.geometry import Transform
 

@@ -25,6 +25,7 @@ from groundtruth.tagslam.problem import Key, Observation, Problem, camera_key, p
 from groundtruth.tagslam.solve import TagSlamSettings, build_graph, grow
 from groundtruth.tagslam.yaml_pieces import NoisyPose
 from groundtruth.tension import tension
+from recordings.constants import MAD_TO_SIGMA
 from recordings.progress import Progress, Silent
 from recordings.tracks import RigCalibration
 
@@ -389,4 +390,4 @@ def _corners(
 def _noise_factor(corners: tuple[Corner, ...]) -> float:
     """By how much the corners' residuals exceed their stated noise: robust, never below 1."""
     scaled = np.concatenate([(c.left_px / c.sigma_px).ravel() for c in corners])
-    return max(1.0, 1.4826 * float(np.median(np.abs(scaled))))
+    return max(1.0, MAD_TO_SIGMA * float(np.median(np.abs(scaled))))

@@ -31,10 +31,10 @@ from groundtruth.session_solve import Solved, solve_session
 from groundtruth.tagslam.answer import pose_rows, reprojection
 from groundtruth.toss_truth import TossTruth, TrackedLimits, at_color_frames
 from groundtruth.verdict import Verdict, judge
-from recordings.documents import json_object
+from recordings.bounded.documents import json_object
+from recordings.bounded.mesh_file import load_mesh
 from recordings.errors import BadInput
 from recordings.geometry import Transform
-from recordings.mesh_file import load_mesh
 from recordings.progress import Progress, Silent
 from recordings.records import StampedPose
 from recordings.session import Session

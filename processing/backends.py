@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from argparse import Namespace
 from dataclasses import dataclass
+from functools import lru_cache
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -84,6 +85,12 @@ def make_segmenter(backends: Backends, background: Segmenter, device: str = "cpu
     from processing.segment.xmem.segmenter import XMemSegmenter
 
     return XMemSegmenter.from_weights(backends.weights, finder=background, device=device)
+
+
+@lru_cache(maxsize=2)
+def matcher_of(backends: Backends, device: str) -> FeatureMatcher:
+    """The chosen matcher, made once: its weights are loaded when it is first asked for."""
+    return make_matcher(backends, device)
 
 
 def make_matcher(backends: Backends, device: str = "cpu") -> FeatureMatcher:

@@ -11,19 +11,21 @@ from typing import TYPE_CHECKING, Any
 
 from processing import backends
 from processing.given_masks import add_masks_argument
-from processing.variants import CONTACT_ONLY, DEFAULT, NAMES, TRACKERS, rows_of
+from processing.variants import CONTACT_ONLY, DEFAULT, NAMES, TRACKERS, WITH_MODEL, rows_of
 from recordings.console import Outcome, Parser, command_parser, progress_for, run_command
 from recordings.errors import BadInput, TosslabError
 from recordings.notices import Notice
 
 if TYPE_CHECKING:
     from processing.config import Config
-    from processing.pipeline import Run
+    from processing.run import Run
+    from processing.variants import Variant
+    from recordings.results.folder import Scope
     from recordings.session import Session
 
 SAMPLE = "sample"
 SAMPLE_FOLDER = Path("samples") / "box_toss"
-CONTACT = "processing.contact.command"
+CONTACT = "processing.contact_command"
 BASELINE_ROW = "bundlesdf-1"
 MODEL_ORDER = ("ours", "converged", "joint", "no-cycle", "no-contact", "no-icp", "bundlesdf-10", "contact-only")
 
@@ -193,17 +195,16 @@ def _process(args: argparse.Namespace, path: Path, name: str, several: bool) -> 
 
 
 def _vision(args: argparse.Namespace, session: Session, name: str, out: Path) -> Outcome:
-    from processing.pipeline import process, process_with_model, start_run, with_table
+    from processing.pipeline import process
+    from processing.start import start_run, with_table
 
     model = None if args.model is None else learned_shape_of(args.model)
     tosses = chosen_tosses(args.toss, session.tosses)
     run = start_run(session, tosses, out, config_of(args), args.tracker, progress_for, args.device)
     run = _started(args, with_table(run) if args.table_from_depth else run)
-    if model is not None:
-        process_with_model(run, model)
-    else:
-        for variant, scope in rows_of(name, args.scope):
-            process(run, variant, scope)
+    rows: list[tuple[Variant, Scope]] = [(WITH_MODEL, "all")] if model is not None else rows_of(name, args.scope)
+    for variant, scope in rows:
+        process(run, variant, scope, model)
     return _evaluate(args, session, out, run)  # the door to truth is opened after every track and shape is written
 
 
@@ -235,9 +236,8 @@ def learned_shape_of(results_path: Path) -> Path:
 
 def config_of(args: argparse.Namespace) -> Config:
     """The pipeline's settings that the command line asks for; everything else stays as it is by default."""
-    from processing.config import Config
+    from processing.config import Config, CycleConfig
     from processing.refine.redrawn_frames import RedrawConfig
-    from processing.stages.second_pass import CycleConfig
 
     redraw = RedrawConfig(depth=args.redraw, occlusion=args.occlusion)
     cycle = CycleConfig(redraw=redraw, renderer=args.renderer, start=args.second_pass)
@@ -251,6 +251,7 @@ def _evaluate(args: argparse.Namespace, session: Session, out: Path, run: Run) -
     from processing.evaluate.score import score_variant, true_mesh
     from processing.evaluate.table import collect, markdown, write_table
     from processing.evaluate.truth import open_truth
+    from processing.pipeline import metric_frames_of
     from processing.store import locked
     from recordings.results.folder import Results
 
@@ -262,7 +263,7 @@ def _evaluate(args: argparse.Namespace, session: Session, out: Path, run: Run) -
         if truth is not None:
             scores[variant] = score_variant(results, record, truth)
             if record.scope == "one":
-                scores[variant] = scores[variant].with_more(*coverage_floor(run, record, truth))
+                scores[variant] = scores[variant].with_more(*coverage_floor(run, metric_frames_of(run), record, truth))
             mesh = true_mesh(truth)
     rows = collect(results, scores)
     with locked(out / ".table.lock"):  # of two runs on one folder, each writes a whole table

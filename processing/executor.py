@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from recordings.documents import read_json
+from recordings.bounded.documents import read_json
 from recordings.errors import BadInput
 
 if TYPE_CHECKING:

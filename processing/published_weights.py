@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from recordings.bounded.limits import MOST_PICKLE_STEPS
 from recordings.errors import BadInput
-from recordings.limits import MOST_PICKLE_STEPS
 
 if TYPE_CHECKING:
     from torch import Tensor

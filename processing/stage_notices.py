@@ -4,25 +4,29 @@ one that was made."""
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
+from typing import Any
 
-from processing.stages.rig import rig_stage
+from processing.config import CycleConfig
+from processing.refine.image_residuals import Difference
+from processing.run import Run
+from processing.stages.register import RegisterResult
+from processing.stages.rig import RigResult
+from processing.stages.rollouts import RolloutResult
+from processing.stages.segment import SegmentResult
+from processing.stages.track import TrackResult
 from processing.store import Done
 from recordings.mcap import arm_codec
 from recordings.notices import Notice
-
-if TYPE_CHECKING:
-    from processing.pipeline import Run
 
 SEE = "look at these frames with `toss-view RESULTS`"
 MANY_UNFIT = 1 / 3
 """Share of a toss's frames from which on more than noise is the likelier cause."""
 
 
-def of_run(run: Run, scene: Done, masks: Mapping[int, Done]) -> list[Notice]:
+def of_run(run: Run, rig: Done[RigResult], masks: Mapping[int, Done[SegmentResult]]) -> list[Notice]:
     """Of the recording, the rig and the masks."""
-    found = [*of_import(run), *of_rig(run, rig_stage(run, scene))]
+    found = [*of_import(run), *of_rig(run, rig)]
     return found + [n for toss, done in masks.items() for n in of_masks(toss, done)]
 
 
@@ -35,9 +39,9 @@ def of_import(run: Run) -> list[Notice]:
     ]
 
 
-def of_rig(run: Run, done: Done) -> list[Notice]:
+def of_rig(run: Run, done: Done[RigResult]) -> list[Notice]:
     """A robot that is not cut out, or only as calibrated; the depth scale that was applied."""
-    found, counts, robot = [], done.counts, done.counts.get("robot")
+    found, result, robot = [], done.result, done.result.robot
     has_arm = any(arm_codec.TOPIC in run.session.toss(t).file.channels for t in run.recorded)
     if isinstance(robot, str) and robot.startswith("place not refined"):
         seen = f"the robot is cut out where the calibration has it: its {robot}"
@@ -47,9 +51,9 @@ def of_rig(run: Run, done: Done) -> list[Notice]:
         seen = f"the robot is not cut out of the images: {robot}"
         do = "where it touches the object, the masks may hold a part of it: look at them with `toss-view RESULTS`"
         found.append(Notice("rig", "medium", seen, do))
-    scale = float(counts.get("depth_scale", 1.0))
+    scale = result.depth_scale
     if scale != 1.0:
-        side, sigma = "far" if scale > 1 else "near", 100 * float(counts.get("scale_sigma") or 0)
+        side, sigma = "far" if scale > 1 else "near", 100 * (result.scale_sigma or 0.0)
         seen = (
             f"the camera's depth reads {100 * abs(scale - 1):.2f} +- {sigma:.2f} % too {side}: all depth was corrected"
         )
@@ -57,24 +61,29 @@ def of_rig(run: Run, done: Done) -> list[Notice]:
     return found
 
 
-def of_masks(toss: int, done: Done) -> list[Notice]:
+def of_masks(toss: int, done: Done[SegmentResult]) -> list[Notice]:
     """Frames of bad light, frames in which others move, frames without depth."""
-    counts, found = done.counts, []
-    of = f"of {counts.get('frames', 0)} frames"
+    result, counts, found = done.result, done.result.followed or {}, []
+    of = f"of {result.frames} frames"
     if dark := counts.get("badly_exposed", 0):
         seen = f"toss {toss}: {dark} {of} are so dark or so bright that their colours say nothing"
         found.append(Notice("masks", "medium", seen, "change light or exposure"))
     if others := counts.get("others_moving", 0):
         seen = f"toss {toss}: in {others} {of} something else of the object's size moves"
         found.append(Notice("masks", "medium", seen, f"the masks may hold a part of it: {SEE}", "likely"))
-    if bare := counts.get("without_depth", 0):
+    if bare := result.without_depth:
         found.append(Notice("masks", "low", f"toss {toss}: {bare} {of} came without a depth image"))
     return found
 
 
-def of_track(toss: int, done: Done) -> list[Notice]:
+def of_tracks(tracks: Mapping[int, Done[TrackResult]]) -> tuple[Notice, ...]:
+    """Tosses in which no single rigid motion explains what is seen."""
+    return tuple(n for toss, done in tracks.items() for n in of_track(toss, done))
+
+
+def of_track(toss: int, done: Done[TrackResult]) -> list[Notice]:
     """Frames that no pose explains. What is behind them is told by how many they are."""
-    unfit, frames = int(done.counts.get("unfit", 0)), max(int(done.counts.get("frames", 0)), 1)
+    unfit, frames = done.result.unfit, max(done.result.frames, 1)
     if not unfit:
         return []
     seen = f"toss {toss}: in {unfit} of {frames} frames no pose explains all that is seen"
@@ -90,3 +99,96 @@ def of_contact(done: Done) -> list[Notice]:
     path = done.folder / "result.json"
     stored = json.loads(path.read_text()).get("warnings", []) if path.exists() else []
     return [Notice.from_json(n) for n in stored]
+
+
+def of_register(done: Done[RegisterResult]) -> list[Notice]:
+    """Tosses that are not in the object frame of the others, or not surely."""
+    found, left_out, unsure = [], list(done.result.not_joined), list(done.result.ambiguous)
+    if left_out:
+        seen = f"tosses {left_out} could not be brought into the object frame of the others: lost"
+        found.append(Notice("register", "high", seen, "another object, or none of its sides that the others show"))
+    if unsure:
+        seen = f"tosses {unsure}: the object looks alike from several sides; their object frame may be turned"
+        found.append(Notice("register", "high", seen, "compare their frames in `toss-view RESULTS`", "possible"))
+    return found
+
+
+def kept_apart(tosses: Sequence[int]) -> Notice:
+    """Tosses that no one shape explains with the others."""
+    seen = f"tosses {list(tosses)}: their place among the others is wrong, no one shape explains both: kept apart"
+    return Notice("register", "high", seen, "another object, or one that looks alike from several sides")
+
+
+def lost_among_all(toss: int) -> tuple[Notice, ...]:
+    """A toss whose cycle begins with its own shape."""
+    return (Notice("place", "medium", f"toss {toss} is lost among all tosses: the cycle begins with its own shape"),)
+
+
+def contact_kept_out(name: str, why: str) -> Notice:
+    """Nothing was learned of contact."""
+    return Notice("contact", "medium", f"{name}: contact learning was kept out: {why}")
+
+
+def contact_shape_worse(name: str, gap: Difference) -> Notice:
+    """Contact's shape was not kept."""
+    seen = f"{name}: the shape that contact learned fits the raw depth worse than vision's ({gap}): kept out"
+    return Notice("contact", "medium", seen, "friction and rollouts are of that shape", "likely")
+
+
+def joint(name: str, contact: str | None, objective: str | None) -> list[Notice]:
+    """What the joint objective could not do."""
+    found = [contact_kept_out(name, contact)] if contact else []
+    return found + ([Notice("joint", "medium", f"{name}: {objective}")] if objective else [])
+
+
+def no_rollouts(done: Done[RolloutResult]) -> tuple[Notice, ...]:
+    """Why Figure 4 is missing."""
+    why = done.result.kept_out
+    return (Notice("rollout", "low", f"no rollouts: {why}"),) if why else ()
+
+
+def second_pass_not_kept(told: Mapping[str, Any]) -> Notice:
+    """The second pass explains the raw images worse."""
+    seen = (
+        f"{told['of']}: the second pass was not kept: it explains the raw images {_percent(told)} worse than the first"
+    )
+    return Notice("second pass", "low", seen, "poses and shape are those before it")
+
+
+def second_pass_kept(told: Mapping[str, Any], config: CycleConfig) -> tuple[str, ...]:
+    """Of a second pass that was kept: how it explains the raw images, and what that means."""
+    if told["same"]:
+        return (f"{told['of']}: the second pass was kept: it only repeats the first one",)
+    if told["worse_share"] > 0:
+        limit = f"beyond {100 * config.much_worse:.0f} % it is left out"
+        return (f"{told['of']}: the second pass was kept: it explains the raw images as well as the first "
+                f"({_percent(told)} worse; {limit})",)  # fmt: skip
+    return (f"{told['of']}: the second pass was kept: it explains the raw images better ({_percent(told)})",)
+
+
+def departures(config: CycleConfig) -> tuple[str, ...]:
+    """Where the second pass is not the paper's, and how to have the paper's."""
+    starts = {"poses": "starts from the first pass's poses", "shape": "starts from the first pass's poses and shape"}
+    notes = []
+    if config.start != "anew":
+        notes.append(f"second pass: {starts[config.start]} (the paper starts anew: --second-pass anew)")
+    if config.redraw.depth != "rendered":
+        notes.append("second pass: measured depth stays where it agrees (the paper draws all: --redraw rendered)")
+    return tuple(notes)
+
+
+def converged(told: Mapping[str, Any]) -> str:
+    """Why no further pass was made."""
+    number, worse = told["pass"], 100 * told["worse_share"]
+    if worse > 0:
+        return f"converged: pass {number} explains the raw images no better (worse by {worse:.2f} %) and is left out"
+    return f"converged: pass {number} changed nothing more"
+
+
+def not_converged(passes: int) -> Notice:
+    """Passes ended before they converged."""
+    return Notice("converged", "low", f"poses and shape still change after {passes} passes more")
+
+
+def _percent(told: Mapping[str, Any]) -> str:
+    return f"{100 * abs(told['worse_share']):.1f} %"

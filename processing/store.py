@@ -17,24 +17,25 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, is_dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, TypeVar
 
-from recordings.documents import read_json
+from recordings.bounded.documents import read_json
 from recordings.errors import BadInput, WriteFailed
 
-Counts = Mapping[str, Any]
+Result = TypeVar("Result")
+"""A frozen dataclass of plain values: what a stage counted and decided, kept in its stage.json."""
 NO_SPACE = (errno.ENOSPC, errno.EDQUOT)
 SHOWN = 8
 """Characters of the key in a folder's name."""
 
 
 @dataclass(frozen=True)
-class Done:
-    """A finished stage: its folder, its whole key, what it counted, and whether it was read rather than run."""
+class Done(Generic[Result]):
+    """A finished stage: its folder, its whole key, its result, and whether it was read rather than run."""
 
     folder: Path
     key: str
-    counts: Counts
+    result: Result
     reused: bool
 
     @property
@@ -70,60 +71,73 @@ class Store:
         version: int,
         config: Any,
         inputs: Mapping[str, str],
-        compute: Callable[[Path], Counts],
-    ) -> Done:
+        kind: type[Result],
+        compute: Callable[[Path], Result],
+    ) -> Done[Result]:
         """The finished stage: read where it is there, computed where not.
 
-        `compute(folder)` writes the stage's files and returns what it counted.
+        `compute(folder)` writes the stage's files and returns its result, a dataclass of this `kind`.
         Raises WriteFailed when the disk is full; whatever interrupts it leaves no half stage behind.
         """
         key = fingerprint(stage, version, config, inputs)
         folder = self.results / f"{stage}-{key[:SHOWN]}"
-        if (found := _finished(folder, key)) is not None:
+        if (found := _finished(folder, key, kind)) is not None:
             return found
         with _spoken(self.results), locked(self.results / f".{folder.name}.lock"):
-            if (found := _finished(folder, key)) is not None:  # made by another run while this one waited
+            if (found := _finished(folder, key, kind)) is not None:  # made by another run while this one waited
                 return found
             partial = folder.with_name(folder.name + ".partial")
             shutil.rmtree(partial, ignore_errors=True)  # of a run that was killed: the lock says that it is gone
             partial.mkdir()
             try:
-                counts = _timed(partial, compute, {"stage": stage, "version": version, "key": key}, config, inputs)
+                result = _timed(partial, compute, {"stage": stage, "version": version, "key": key}, config, inputs)
                 partial.rename(folder)
             except BaseException:
                 shutil.rmtree(partial, ignore_errors=True)
                 raise
-        return Done(folder, key, counts, reused=False)
+        return Done(folder, key, result, reused=False)
 
 
 def _timed(
-    partial: Path, compute: Callable[[Path], Counts], about: Mapping[str, Any], config: Any, inputs: Mapping[str, str]
-) -> Counts:
+    partial: Path, compute: Callable[[Path], Result], about: Mapping[str, Any], config: Any, inputs: Mapping[str, str]
+) -> Result:
     """Compute, then write stage.json with what it took; stage.json last, so that it marks a whole stage."""
     wall, cpu = time.monotonic(), time.process_time()
-    counts = dict(compute(partial))
+    result = compute(partial)
     document = {
         **about,
         "config": plain(config),
         "inputs": dict(inputs),
         "seconds": round(time.monotonic() - wall, 3),
         "cpu_seconds": round(time.process_time() - cpu, 3),
-        "counts": counts,
+        "counts": plain(result),
     }
     with open(partial / "stage.json", "w") as out:
         json.dump(document, out, indent=1)
         out.flush()
         os.fsync(out.fileno())
-    return counts
+    return result
 
 
-def _finished(folder: Path, key: str) -> Done | None:
+def _finished(folder: Path, key: str, kind: type[Result]) -> Done[Result] | None:
     if not (folder / "stage.json").exists():
         return None
     document = read_json(folder / "stage.json", "; remove that folder and run again")
     if document.get("key") != key:
         raise BadInput(f"{folder} belongs to another key ({document.get('key')}); remove that folder and run again")
-    return Done(folder, key, document.get("counts", {}), reused=True)
+    return Done(folder, key, _as_result(kind, document.get("counts", {}), folder), reused=True)
+
+
+def _as_result(kind: type[Result], document: Mapping[str, Any], folder: Path) -> Result:
+    """A stage's result as it was written: lists are tuples again. Raises BadInput where it is another stage's."""
+    try:
+        return kind(**{name: _tuples(value) for name, value in document.items()})
+    except TypeError as wrong:
+        raise BadInput(f"{folder}/stage.json is damaged ({wrong}); remove that folder and run again") from wrong
+
+
+def _tuples(value: Any) -> Any:
+    return tuple(_tuples(x) for x in value) if isinstance(value, list) else value
 
 
 @contextmanager

@@ -66,6 +66,15 @@ def find_variant(name: str) -> Variant:
     raise BadInput(f"there is no variant '{name}'; available: {', '.join(NAMES)}")
 
 
+def refuse_baseline(tracker: str) -> None:
+    """Raises BadInput for the baseline, where a row needs all tosses in one object frame."""
+    if tracker != TRACKERS[0]:
+        raise BadInput(
+            f"--tracker {tracker} has no registration between tosses, so bundlesdf-1 is its only row; "
+            f"take --tracker {TRACKERS[0]}, or --variant bundlesdf-1"
+        )
+
+
 def rows_of(name: str, scope: Scope) -> list[tuple[Variant, Scope]]:
     """The rows to make for a name: one, or with `table` all of them in both scopes. Raises BadInput."""
     if name == WHOLE_TABLE:

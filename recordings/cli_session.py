@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from recordings.cli_inspect import add_commands
 from recordings.console import Outcome, Parser, add_command, command_parser, progress_for, run_command
+from recordings.verify.command import add_commands
 
 EXPORTS = {
     "folder": ("the folder layout: images, depth, times, joint states as files", "SESSION"),

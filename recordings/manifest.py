@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from recordings.documents import as_dict, read_document
+from recordings.bounded.documents import as_dict, read_document
 from recordings.errors import BadInput
 from recordings.session_writer import file_sha256, write_json
 

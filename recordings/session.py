@@ -13,8 +13,8 @@ from jaxtyping import Float32, Int64
 from numpy import ndarray as Array
 
 from recordings import sync
-from recordings.align import align_depth
-from recordings.documents import (
+from recordings.alignment.align import align_depth
+from recordings.bounded.documents import (
     FORMAT_VERSION,
     mapping,
     parse_document,

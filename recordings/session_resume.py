@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from recordings.documents import as_dict, json_object, read_document
+from recordings.bounded.documents import as_dict, json_object, read_document
 from recordings.errors import BadInput
 from recordings.mcap.file import McapFile
 from recordings.mcap.recover import STOP, Recovered, recover_file

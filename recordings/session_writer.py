@@ -19,7 +19,7 @@ from foxglove_schemas_protobuf.JointStates_pb2 import JointStates
 from jaxtyping import Bool
 from numpy import ndarray as Array
 
-from recordings.documents import FORMAT_VERSION as FORMAT_VERSION
+from recordings.bounded.documents import FORMAT_VERSION as FORMAT_VERSION
 from recordings.errors import BadInput, WriteFailed
 from recordings.geometry import Transform
 from recordings.mcap import arm_codec, codec

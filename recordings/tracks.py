@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Int64, UInt8
 from numpy import ndarray as Array
 
-from recordings.documents import read_json
+from recordings.bounded.documents import read_json
 from recordings.errors import BadInput
 from recordings.geometry import CameraModel, Transform
 

@@ -14,9 +14,13 @@ import pytest
 import trimesh
 
 from processing.config import Config
-from processing.pipeline import start_run
-from processing.stages.masks import object_masks, static_scene
-from processing.stages.vision import track_stage
+from processing.images import raw_images
+from processing.stages.find import find_object
+from processing.stages.rig import refine_rig
+from processing.stages.scene import learn_static_scene
+from processing.stages.segment import segment
+from processing.stages.track import track as track_toss
+from processing.start import start_run
 from recordings.importers.folder import import_folder
 from recordings.progress import Silent
 from recordings.results.folder import read_track
@@ -45,7 +49,10 @@ def test_one_toss_of_a_known_object_is_tracked_as_well_as_its_figure(name, data,
     import_folder(data(name), tmp_path / "session")
     with Session.open(tmp_path / "session") as session:
         run = start_run(session, [0], tmp_path / "results", Config(), "multi-hypothesis", lambda _: Silent())
-        done = track_stage(run, 0, object_masks(run, 0, static_scene(run)))
+        scene = learn_static_scene(run)
+        rig = refine_rig(run, scene)
+        masks = segment(run, 0, scene, rig, find_object(run, scene, rig))
+        done = track_toss(run, raw_images(run, 0, rig, masks))
     track = read_track(done.folder, 0)
     true = np.load(truth / "toss_00" / "poses_camera_object.npz")["T_camera_object"]
     points_m = trimesh.load_mesh(truth / "mesh.obj").vertices

@@ -38,15 +38,23 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
 from acquisition.arm.limits import arm_model  # noqa: E402
-from acquisition.arm.toss import ReleaseDelay, Samples, TossRefused, check_limits, draw_target, plan_toss
+from acquisition.arm.toss import (  # noqa: E402
+    ReleaseDelay,
+    Samples,
+    TossRefused,
+    check_limits,
+    draw_target,
+    plan_toss,
+)
 from acquisition.arm.workspace import Space  # noqa: E402
 from acquisition.detect import Eye, TossWatcher  # noqa: E402
-from acquisition.drivers.synthetic import SyntheticConfig, SyntheticLab, SyntheticThrower  # noqa: E402
+from acquisition.drivers.synthetic import SyntheticLab, SyntheticThrower  # noqa: E402
 from acquisition.operator import Nobody  # noqa: E402
 from acquisition.rig import DeviceEntry, RecordingConfig, Rig, TossConfig  # noqa: E402
 from acquisition.run import Options, SessionRun  # noqa: E402
 from acquisition.streaming.clock import ClockMapper, SessionClock  # noqa: E402
 from acquisition.streaming.recorder import Recorder  # noqa: E402
+from acquisition.synthetic.lab_config import SyntheticConfig  # noqa: E402
 from acquisition.verdict import Verdict  # noqa: E402
 from recordings.geometry import Transform, rotation_exp  # noqa: E402
 from recordings.progress import Silent  # noqa: E402

@@ -2,7 +2,7 @@
 
 python tools/bench_session.py            # all, about five minutes
 python tools/bench_session.py --quick    # shorter recordings, a smaller file, fewer kills
-python tools/bench_session.py write      # one of: codec write read info kill
+python tools/bench_session.py write      # one of: codec align write read info kill
 
 CPU seconds are of the whole process with all its threads. The 20,000 mutations are tests/recordings/test_fuzz.py.
 """
@@ -37,12 +37,13 @@ from foxglove_schemas_protobuf.RawImage_pb2 import RawImage  # noqa: E402
 from mcap.reader import make_reader  # noqa: E402
 from mcap.writer import Writer as PlainWriter  # noqa: E402
 
-from recordings.geometry import CameraModel  # noqa: E402
+from recordings.alignment.align import align_depth  # noqa: E402
+from recordings.geometry import CameraModel, Transform  # noqa: E402
 from recordings.mcap.codec import decode_image, schema_descriptor  # noqa: E402
 from recordings.mcap.depth_codec import pack_depth, unpack_depth  # noqa: E402
+from recordings.mcap.recover_session import recover  # noqa: E402
 from recordings.mcap.writer import CHUNK_BYTES, CHUNK_NS  # noqa: E402
 from recordings.records import ArmStates, DepthImage, EncodedImage  # noqa: E402
-from recordings.recover_session import recover  # noqa: E402
 from recordings.schemas.tosslab_pb2 import DepthImage as DepthMessage  # noqa: E402
 from recordings.session import Session  # noqa: E402
 from recordings.session_writer import SessionWriter, TossWriter  # noqa: E402
@@ -232,6 +233,18 @@ def bench_codec(_: Path, quick: bool) -> Iterator[Row]:
         )
 
 
+def bench_align(_: Path, quick: bool) -> Iterator[Row]:
+    """Depth of the sensor's size seen from the colour camera."""
+    depth_camera, color = (
+        CameraModel(name, w, h, np.array([[f, 0, w / 2], [0, f, h / 2], [0, 0, 1]]), "none", ())
+        for name, w, h, f in (("depth", 848, 480, 425.0), ("color", 640, 480, 386.0))
+    )
+    color_from_depth = Transform("color", "depth", np.eye(3), np.array([0.059, 0.0, 0.0]))
+    depth_m = np.full((480, 848), 0.8, np.float32)
+    spent = best_ms(lambda: align_depth(depth_m, depth_camera, color, color_from_depth), 6 if quick else 15)
+    yield Row("align 848x480 depth to 640x480 colour", f"{spent:.1f} ms", "", "60 ms")
+
+
 def bench_write(folder: Path, quick: bool) -> Iterator[Row]:
     seconds = 3.0 if quick else 10.0
     for width, height in ((640, 480), (848, 480)):
@@ -419,7 +432,14 @@ def victim(folder: Path, pixels: Pixels, pipe: int) -> None:
     paced(1e6, frame)
 
 
-PARTS = {"codec": bench_codec, "write": bench_write, "read": bench_read, "info": bench_info, "kill": bench_kill}
+PARTS = {
+    "codec": bench_codec,
+    "align": bench_align,
+    "write": bench_write,
+    "read": bench_read,
+    "info": bench_info,
+    "kill": bench_kill,
+}
 
 
 def main() -> int:

@@ -1,7 +1,7 @@
 """Checks all that `make check` promises: style, types, the house's walls, the size of files, no names of machines.
 
 python tools/check.py           # all
-python tools/check.py walls     # one of: style format types walls house
+python tools/check.py walls     # one of: style format types walls circles house
 """
 
 from __future__ import annotations
@@ -10,13 +10,18 @@ import ast
 import re
 import subprocess
 import sys
+from collections import Counter
 from collections.abc import Callable, Iterator
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 BIN = Path(sys.executable).parent
 MOST_LINES = 400
 MOST_FUNCTION_LINES = 80
+MOST_FILES = 20
+LEAST_DOCUMENTED = 0.95
+PACKAGES = ("acquisition", "calibration", "groundtruth", "processing", "recordings")
 REASON = "# long because:"
 GENERATED = re.compile(r"_pb2\.pyi?$")
 # Written in pieces, so that this file does not find itself.
@@ -60,6 +65,56 @@ def house() -> Iterator[str]:
             yield from too_long(name, text)
         if name.startswith("tests/") and path.name == "__init__.py":
             yield f"{name}: no __init__.py under tests/ (pytest imports by path)"
+    yield from full_folders()
+    yield from undocumented()
+
+
+def modules() -> Iterator[Path]:
+    """Python files of the packages."""
+    for path in our_files():
+        name = path.relative_to(ROOT).as_posix()
+        if path.suffix == ".py" and name.split("/")[0] in PACKAGES and not GENERATED.search(name):
+            yield path
+
+
+def full_folders() -> Iterator[str]:
+    """Folders of the packages with too many files to be taken in at a glance."""
+    count = Counter(path.parent for path in modules() if path.name != "__init__.py")
+    for folder, files in sorted(count.items()):
+        if files > MOST_FILES:
+            yield f"{folder.relative_to(ROOT)}: {files} files, wanted at most {MOST_FILES}; make a folder of some"
+
+
+def undocumented() -> Iterator[str]:
+    """Public functions and classes of processing without a docstring, where they are too many."""
+    bare, count = [], 0
+    for path in (p for p in modules() if p.relative_to(ROOT).parts[0] == "processing"):
+        for node in ast.parse(path.read_text()).body:
+            if isinstance(node, ast.FunctionDef | ast.ClassDef) and not node.name.startswith("_"):
+                count += 1
+                if ast.get_docstring(node) is None:
+                    bare.append(f"{path.relative_to(ROOT)}:{node.lineno}: {node.name} has no docstring")
+    if len(bare) > (1 - LEAST_DOCUMENTED) * count:
+        yield f"processing: {count - len(bare)} of {count} public names have a docstring, wanted {LEAST_DOCUMENTED:.0%}"
+        yield from bare
+
+
+def circles() -> Iterator[str]:
+    """Modules that import each other, at whatever depth; imports for type checking and within functions count."""
+    names = {".".join(p.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): p for p in modules()}
+    graph: dict[str, set[str]] = {}
+    for name, path in names.items():
+        found: set[str] = set()
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ImportFrom) and node.module:
+                found |= {node.module, *(f"{node.module}.{a.name}" for a in node.names)}
+            elif isinstance(node, ast.Import):
+                found |= {a.name for a in node.names}
+        graph[name] = (found & names.keys()) - {name}
+    try:
+        tuple(TopologicalSorter(graph).static_order())
+    except CycleError as circle:
+        yield f"an import circle: {' -> '.join(reversed(circle.args[1]))}"
 
 
 def hidden_machines(name: str, text: str) -> Iterator[str]:
@@ -86,6 +141,7 @@ CHECKS: dict[str, Callable[[], Iterator[str]]] = {
     "format": tool("ruff", "format", "--check", "--quiet", "--output-format", "concise", "."),
     "types": tool("mypy", "--no-error-summary"),
     "walls": tool("lint-imports", "--no-cache", "--no-logo"),
+    "circles": circles,
     "house": house,
 }
 

@@ -39,8 +39,8 @@ from acquisition.devices import (
     RgbdCapture,
     Stamp,
 )
+from acquisition.ready_rig import Setup
 from acquisition.rig import DeviceEntry, RecordingConfig, Rig
-from acquisition.setup import Setup
 from recordings.errors import BadInput
 from recordings.geometry import CameraModel, Transform
 from recordings.mcap.codec import decode_image

@@ -6,6 +6,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
+from recordings.constants import GRAVITY_M_S2
+
 Shape = Literal["cube", "box", "prism", "l", "mug", "mesh"]
 Surface = Literal["textured", "tagged", "few", "plain", "glossy", "dark"]
 DepthPreset = Literal["default", "high-accuracy", "high-density"]
@@ -34,7 +36,7 @@ class ContactConfig:
     time_constant_s: float = 0.004
     damping_ratio: float = 0.6
     step_s: float = 0.0005
-    gravity_m_s2: float = 9.81
+    gravity_m_s2: float = GRAVITY_M_S2
 
 
 @dataclass(frozen=True)

@@ -39,8 +39,8 @@ from recordings.progress import Progress
 from recordings.tracks import RigCalibration
 
 if TYPE_CHECKING:
-    from acquisition.drivers.synthetic import SyntheticConfig
     from acquisition.synthetic.lab import Lab
+    from acquisition.synthetic.lab_config import SyntheticConfig
 
 GRIPPER = 80
 STILL_RAYS = 700_000

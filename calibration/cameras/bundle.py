@@ -22,6 +22,7 @@ from scipy import sparse
 from calibration.cameras.poses import exp_poses
 from calibration.cameras.projection_derivatives import by_lens, by_motion, by_point, lens_numbers, projected, with_lens
 from recordings.geometry import CameraModel
+from recordings.robust import huber_cost, huber_weight
 
 POSE = 6
 STEPS = 40
@@ -237,7 +238,7 @@ def _cost(residual: Float[Array, "n 2"], huber: float | None) -> float:
     length = np.linalg.norm(residual, axis=1)
     if huber is None:
         return float((length**2).sum())
-    return float(np.where(length <= huber, length**2, huber * (2 * length - huber)).sum())
+    return 2 * float(huber_cost(length, huber).sum())
 
 
 def _linearised(
@@ -245,7 +246,7 @@ def _linearised(
 ) -> tuple[Float[Array, "n 2"], Float[Array, " n"], sparse.csr_matrix]:
     residual, in_camera = _whitened(scene, seen)
     length = np.maximum(np.linalg.norm(residual, axis=1), 1e-12)
-    weight = np.ones(len(length)) if huber is None else np.minimum(1.0, huber / length)
+    weight = np.ones(len(length)) if huber is None else huber_weight(length, huber)
     rows, columns, values = [], [], []
     owners = {"view": seen.view, "piece": seen.piece, "scale": seen.piece, "mark": seen.mark, "image": seen.image}
     for kind, part in _derivatives(scene, seen, in_camera).items():

@@ -28,8 +28,8 @@ from numpy import ndarray as Array
 from calibration.tags.detector_process import COUNT, HEADER, TAG_VALUES
 from calibration.tags.edges import refine_corners
 from calibration.tags.pattern import refine_by_pattern
+from recordings.bounded.limits import open_npz
 from recordings.errors import BadInput, TosslabError
-from recordings.limits import open_npz
 from recordings.progress import Progress, Silent
 from recordings.records import TagSighting
 

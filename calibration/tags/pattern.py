@@ -22,6 +22,9 @@ from jaxtyping import Bool, Float, Float32
 from numpy import ndarray as Array
 from scipy import fft
 
+from recordings.constants import MAD_TO_SIGMA
+from recordings.robust import huber_weight
+
 DICTIONARIES = {
     "tag36h11": (cv2.aruco.DICT_APRILTAG_36H11, 8),
     "tag25h9": (cv2.aruco.DICT_APRILTAG_25H9, 7),
@@ -219,8 +222,8 @@ def _step(
     a, d = half * contrast * across, half * contrast * down
     moves = [a * u, a * v, a, d * u, d * v, d, -(a * u * u + d * u * v), -(a * u * v + d * v * v)]
     jacobian = np.hstack([np.stack([*moves, contrast * wider, contrast * spilled], 1), light])
-    usual = 1.4826 * float(np.median(np.abs(residual))) + 1e-6
-    weight = np.minimum(1.0, HUBER * usual / np.maximum(np.abs(residual), 1e-9)) if robust else np.ones(len(u))
+    usual = MAD_TO_SIGMA * float(np.median(np.abs(residual))) + 1e-6
+    weight = huber_weight(np.abs(residual), HUBER * usual) if robust else np.ones(len(u))
     weight = np.where((values >= SATURATED) & (residual > 0), 0.0, weight)
     weighted = jacobian * weight[:, None]
     normal = weighted.T @ jacobian

@@ -13,8 +13,8 @@ import numpy as np
 from jaxtyping import Float, Int64
 from numpy import ndarray as Array
 
+from recordings.bounded.limits import copy_unpacked, open_npz
 from recordings.errors import BadInput
-from recordings.limits import copy_unpacked, open_npz
 
 APRILTAG_ARRAY = """
 std_msgs/Header header

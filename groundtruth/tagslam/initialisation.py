@@ -21,6 +21,7 @@ from numpy import ndarray as Array
 from groundtruth import se3
 from groundtruth.factors import CORNERS
 from groundtruth.tagslam.problem import Key, Observation, Problem, camera_key, tag_key
+from recordings.robust import huber_weight
 
 EYE, RIG, BODY, TAG = range(4)
 
@@ -238,7 +239,7 @@ class Growth:
             residual = self._project(points, ready.camera) - ready.corners_px
             size = np.linalg.norm(residual, axis=-1)
             reach = 3 * max(float(np.quantile(size, agreeing)), 0.3)
-            weight = np.minimum(1.0, reach / np.maximum(size, 1e-9))
+            weight = huber_weight(size, reach)
             J = self._by_point(points, ready.camera) @ camera_from_x[:, None, :3, :3] @ arm
             weighted = J * weight[..., None, None]
             information = np.einsum("nkij,nkil->jl", weighted, J) + 1e-9 * np.eye(6)

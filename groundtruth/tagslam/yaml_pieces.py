@@ -16,9 +16,9 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray as Array
 
+from recordings.bounded.yaml_file import parse_yaml
 from recordings.errors import BadInput
 from recordings.geometry import rotation_exp
-from recordings.yaml_file import parse_yaml
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,14 +16,12 @@ from jaxtyping import Bool, Float, Float32, Int, UInt8
 from numpy import ndarray as Array
 from scipy.spatial import cKDTree
 
+from processing.sensor import noise
 from recordings.errors import BadInput
 from recordings.geometry import CameraModel, nearest_rotation, rotation_exp
 from recordings.progress import Progress
 from recordings.records import RgbdFrame
 from recordings.tracks import ObjectShape, ObjectTrack, Status
-
-CORRELATED_PX = 9.0
-"""Neighbouring depth pixels share their noise: so many count as one measurement in the covariance."""
 
 
 @dataclass(frozen=True)
@@ -355,5 +353,5 @@ def covariance_of(
     """
     normals = normals_object @ pose[:3, :3].T
     rows = np.hstack([np.cross(points_m - pose[:3, 3], normals), normals])
-    information = rows.T @ rows / (CORRELATED_PX * max(sigma_m, 1e-4) ** 2)
+    information = rows.T @ rows / (noise.BASELINE_PIXELS_PER_MEASUREMENT * max(sigma_m, 1e-4) ** 2)
     return np.linalg.inv(information + np.eye(6))

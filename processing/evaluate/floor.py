@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,18 +14,30 @@ from processing.evaluate.score import Value, chamfers, true_mesh
 from processing.field.fuse import fuse
 from processing.field.learn import TossViews, chosen_views
 from processing.field.mesh import grid_mesh
-from processing.sensor.frames import every_frame
-from processing.store import Counts
+from processing.run import Run
 from recordings.errors import BadInput
 from recordings.results.folder import RobotMasks, VariantRecord, read_masks, read_shape, write_shape
+from recordings.session import RgbdFrames
 from recordings.tracks import ObjectTrack, Status
 
 if TYPE_CHECKING:
     from processing.evaluate.truth import Truth
-    from processing.pipeline import Run
 
 
-def coverage_floor(run: Run, record: VariantRecord, truth: Truth) -> tuple[dict[str, Value], tuple[str, ...]]:
+VERSION = 3
+WHERE = "each toss fused at its true poses, rigid ICP"
+
+
+@dataclass(frozen=True)
+class FloorResult:
+    """Frames that were fused."""
+
+    views: int
+
+
+def coverage_floor(
+    run: Run, frames: Mapping[int, RgbdFrames], record: VariantRecord, truth: Truth
+) -> tuple[dict[str, Value], tuple[str, ...]]:
     """`cd_floor`: mean Chamfer distance over the tosses, each toss's frames fused at its true poses; and of which
     tosses it could not be computed, and why. Uses the truth, so it is called by the scorer only."""
     mesh = true_mesh(truth)
@@ -33,7 +46,7 @@ def coverage_floor(run: Run, record: VariantRecord, truth: Truth) -> tuple[dict[
     found, failed = [], []
     for entry in (t for t in record.tosses if t.toss in run.tosses):
         try:
-            folder = _fused(run, entry.toss, run.store.results / str(entry.masks), truth)
+            folder = _fused(run, entry.toss, frames[entry.toss], run.store.results / str(entry.masks), truth)
         except BadInput as why:
             failed.append(f"toss {entry.toss}: what its frames show of the shape (floor) is not known: {why}")
             continue
@@ -42,12 +55,8 @@ def coverage_floor(run: Run, record: VariantRecord, truth: Truth) -> tuple[dict[
     return values, tuple(failed)
 
 
-WHERE = "each toss fused at its true poses, rigid ICP"
-
-
-def _fused(run: Run, toss: int, masks: Path, truth: Truth) -> Path:
+def _fused(run: Run, toss: int, frames: RgbdFrames, masks: Path, truth: Truth) -> Path:
     """Stage `floor` of one toss. Raises BadInput where the truth has no poses of it or no frame shows the object."""
-    frames = every_frame(run, toss)
     track = ObjectTrack.nowhere(toss, run.camera.frame, frames.times_ns)
     poses = truth.camera_from_object(track)
     if poses is None or not np.isfinite(poses).any():
@@ -57,11 +66,11 @@ def _fused(run: Run, toss: int, masks: Path, truth: Truth) -> Path:
     inputs = {f"toss_{toss:02d}": run.keys[f"toss_{toss:02d}"], "masks": masks.name,
               "truth": hashlib.sha256(np.nan_to_num(poses).tobytes()).hexdigest()}  # fmt: skip
 
-    def compute(folder: Path) -> Counts:
+    def compute(folder: Path) -> FloorResult:
         robot = RobotMasks.of(masks, toss)
         seen = TossViews(frames, frames.depth_times_ns, read_masks(masks, toss), known, robot=robot)
         views = chosen_views([seen], run.camera, run.config.shape)
         write_shape(folder, grid_mesh(fuse(views, run.config.shape.field.fuse)))
-        return {"views": len(views), "from": "true poses: for the scores only"}
+        return FloorResult(len(views))
 
-    return run.store.run("floor", 2, run.config.shape.field.fuse, inputs, compute).folder
+    return run.store.run("floor", VERSION, run.config.shape.field.fuse, inputs, FloorResult, compute).folder

@@ -29,7 +29,7 @@ from processing.evaluate.metrics import (
 )
 from processing.evaluate.truth import Truth
 from processing.motion.frame_phases import PHASES, Phase, frame_phases
-from recordings.mesh_file import load_mesh
+from recordings.bounded.mesh_file import load_mesh
 from recordings.results.folder import Results, VariantRecord, read_contact
 from recordings.tracks import ObjectShape, ObjectTrack
 

@@ -14,11 +14,11 @@ import numpy as np
 from jaxtyping import Float, Int64
 from numpy import ndarray as Array
 
-from processing.start_pose import StartPose
-from recordings.documents import json_object
+from processing.run import StartPose
+from recordings.bounded.documents import json_object
+from recordings.bounded.limits import open_npz
 from recordings.errors import BadInput, DamagedFile
 from recordings.geometry import Transform
-from recordings.limits import open_npz
 from recordings.session import Session, Toss
 from recordings.tracks import ObjectTrack, RigCalibration
 

@@ -16,6 +16,7 @@ from numpy import ndarray as Array
 
 from processing.features.sift import lifted
 from processing.sensor.view import ViewStore
+from recordings.constants import LUMA
 from recordings.errors import BadInput
 
 STRIDE = 32
@@ -64,7 +65,7 @@ def picture_of(store: ViewStore, view: int, config: PictureConfig) -> Picture | 
     rows, columns = np.flatnonzero(crop.mask.any(1)), np.flatnonzero(crop.mask.any(0))
     top, left = max(int(rows[0]) - config.rim_px, 0), max(int(columns[0]) - config.rim_px, 0)
     area = np.s_[top : int(rows[-1]) + config.rim_px + 1, left : int(columns[-1]) + config.rim_px + 1]
-    gray, mask = crop.color[area] @ np.array([0.299, 0.587, 0.114], dtype=np.float32), crop.mask[area]
+    gray, mask = crop.color[area] @ np.array(LUMA, dtype=np.float32), crop.mask[area]
     low, high = np.quantile(gray[mask], [0.02, 0.98])
     shown = np.clip((gray - low) / max(high - low, 0.05), 0, 1)
     scale = float(np.clip(config.side_px / max(shown.shape), 1.0, config.most_enlarged))

@@ -13,8 +13,9 @@ import numpy as np
 from jaxtyping import Float, Float32, Int
 from numpy import ndarray as Array
 
+from processing.sensor import view_layout as lay
 from processing.sensor.view import Crop, ViewStore
-from processing.track import kernels as k
+from recordings.constants import LUMA
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +95,7 @@ def _tight(crop: Crop, rim: int = 4) -> tuple[Float[Array, "2"], Array, Array]:
     rows, columns = np.flatnonzero(crop.mask.any(1)), np.flatnonzero(crop.mask.any(0))
     top, left = max(rows[0] - rim, 0), max(columns[0] - rim, 0)
     area = np.s_[top : rows[-1] + rim + 1, left : columns[-1] + rim + 1]
-    gray = crop.color[area] @ np.array([0.299, 0.587, 0.114], dtype=np.float32)
+    gray = crop.color[area] @ np.array(LUMA, dtype=np.float32)
     low, high = np.quantile(gray[crop.mask[area]], [0.02, 0.98])
     stretched = np.clip((gray - low) / max(high - low, 0.05), 0, 1) * 255
     grown = cv2.dilate(crop.mask[area].astype(np.uint8), np.ones((3, 3), np.uint8))
@@ -108,11 +109,11 @@ def lifted(store: ViewStore, view: int, uv: Float[Array, "n 2"]) -> tuple[Float[
     crop = store.crops[view]
     assert crop is not None
     h, w = crop.mask.shape
-    offset = int(store.table[view, k.OFFSET])
-    z_map = store.maps[offset : offset + h * w, k.Z].reshape(h, w)
+    offset = int(store.table[view, lay.OFFSET])
+    z_map = store.maps[offset : offset + h * w, lay.Z].reshape(h, w)
     cell = np.clip(np.round(uv).astype(int), 0, [w - 1, h - 1])
     z = z_map[cell[:, 1], cell[:, 0]].astype(np.float64)
-    c = store.optics.camera
+    c = store.rectified.camera
     x = (uv[:, 0] + crop.corner[0] - c.cx) / c.fx
     y = (uv[:, 1] + crop.corner[1] - c.cy) / c.fy
     return np.stack([x * z, y * z, z], -1), z > 0

@@ -6,13 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Bool, Float, Int64
+from jaxtyping import Bool, Int64
 from numpy import ndarray as Array
-from scipy.spatial.transform import Rotation, Slerp
 
 from processing.field.mesh import extract_mesh
 from processing.field.train import FieldConfig, train_field
 from processing.field.views import FieldView, make_view
+from processing.motion.interpolate import pose_at
 from recordings.errors import BadInput
 from recordings.geometry import CameraModel
 from recordings.progress import Progress
@@ -79,39 +79,3 @@ def _view(toss: TossViews, position: int, camera: CameraModel) -> FieldView | No
     mask = toss.masks[position]
     robot = None if toss.robot is None else toss.robot.at(position, mask.shape)
     return make_view(toss.frames[position], mask, camera, pose, at_depth, robot, foreign)
-
-
-FREE_M_S2 = 15.0
-"""A body that is not hit accelerates by less than this (gravity, an arm)."""
-
-
-def pose_at(track: ObjectTrack, position: int, time_ns: int) -> Float[Array, "4 4"]:
-    """`camera_from_object` at a time near a frame's: moved along the way to the neighbour on that side, if tracked; on
-    a parabola through both neighbours where nothing hits the object (in 16 ms a falling one leaves the straight way by
-    more than a millimetre)."""
-    here = track.camera_from_object[position]
-    side = 1 if time_ns > track.time_ns[position] else -1
-    other = position + side
-    if time_ns == track.time_ns[position] or not 0 <= other < len(track.status) or track.status[other] == "lost":
-        return here
-    there = track.camera_from_object[other]
-    share = (time_ns - int(track.time_ns[position])) / int(track.time_ns[other] - track.time_ns[position])
-    share = min(share, 1.0)
-    out = np.eye(4)
-    turns = Slerp([0.0, 1.0], Rotation.from_matrix(np.stack([here[:3, :3], there[:3, :3]])))
-    out[:3, :3] = turns(share).as_matrix()
-    step_s = float(track.time_ns[other] - track.time_ns[position]) * 1e-9
-    bend = 0.5 * share * (share - 1) * step_s**2 * _acceleration(track, position)
-    out[:3, 3] = (1 - share) * here[:3, 3] + share * there[:3, 3] + bend
-    return out
-
-
-def _acceleration(track: ObjectTrack, position: int) -> Float[Array, "3"]:
-    """Of the object's origin over a frame and its two neighbours; zero where one is missing or something hits it."""
-    around = [position - 1, position, position + 1]
-    if around[0] < 0 or around[2] >= len(track.status) or any(track.status[i] == "lost" for i in around):
-        return np.zeros(3)
-    first_s, second_s = np.diff(track.time_ns[around]).astype(np.float64) * 1e-9
-    x0, x1, x2 = track.camera_from_object[around, :3, 3]
-    change = 2 * ((x2 - x1) / second_s - (x1 - x0) / first_s) / (first_s + second_s)
-    return np.asarray(change) if float(np.linalg.norm(change)) < FREE_M_S2 else np.zeros(3)

@@ -14,8 +14,8 @@ from torch import Tensor
 
 from processing.field.network import ObjectField
 from processing.field.rays import RayPool
-
-LUMA = (0.299, 0.587, 0.114)
+from processing.sensor import noise
+from recordings.constants import LUMA
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class PoseConfig:
     """Gauss-Newton steps a round."""
     most_pixels: int = 1500
     """Pixels a view, drawn at random."""
-    depth_sigma_m: float = 0.0015
+    depth_sigma_m: float = noise.FIELD_SIGMA_M
     """Standard deviation of depth at 0.8 m; it grows with the square of the distance."""
     color_sigma: float = 0.07
     """Of luminance, 0..1."""
@@ -89,7 +89,7 @@ def _normal_equations(
     luma, luma_gradient = _with_gradient(lambda x: model.color(x) @ torch.tensor(LUMA, device=x.device), on_surface)
     luma_gradient = luma_gradient - sdf_gradient * ((luma_gradient * along).sum(-1) / facing)[:, None]
     seen = pool.rgb[rays] @ torch.tensor(LUMA, device=points.device)
-    depth_sigma = config.depth_sigma_m * (pool.depth[rays] / 0.8) ** 2
+    depth_sigma = config.depth_sigma_m * (pool.depth[rays] / noise.FIELD_SIGMA_AT_M) ** 2
     colored = pool.colored[rays]
     difference = _less_exposure(luma - seen, view, len(rotation), colored)
     information = torch.zeros(len(rotation), 6, 6, device=points.device)
@@ -101,16 +101,12 @@ def _normal_equations(
         jacobian = torch.cat([torch.linalg.cross(points, gradient), gradient], -1)
         scaled = (residual / sigma).abs()
         weight = torch.where(scaled < 1.5, torch.ones_like(scaled), 1.5 / scaled) / sigma**2
-        weight = torch.where(scaled < outlier, weight, torch.zeros_like(weight)) * CORRELATED
+        weight = torch.where(scaled < outlier, weight, torch.zeros_like(weight)) * noise.FIELD_INDEPENDENT_SHARE
         if residual is difference:
             weight = weight * colored
         information.index_add_(0, view, weight[:, None, None] * jacobian[:, :, None] * jacobian[:, None, :])
         right.index_add_(0, view, -(weight * residual)[:, None] * jacobian)
     return information, right
-
-
-CORRELATED = 0.1
-"""Neighbouring pixels share their noise: this share of them counts as independent."""
 
 
 def _less_exposure(difference: Tensor, view: Tensor, views: int, colored: Tensor) -> Tensor:

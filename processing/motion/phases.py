@@ -14,7 +14,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray as Array
 
-from processing.motion.trajectory import GRAVITY_M_S2, PoseSeries, differences, rotation_vectors
+from processing.motion.trajectory import PoseSeries, differences, rotation_vectors
+from recordings.constants import GRAVITY_M_S2, MAD_TO_SIGMA
 
 SEGMENT_PRICE = 30.0
 """Misfit (chi squared) that one more segment must save."""
@@ -23,8 +24,6 @@ FLIGHT_FRAMES = 3
 REST_FRAMES = 4
 LEAST_SIGMA_M, LEAST_SIGMA_RAD = 5e-5, 1e-3
 """No track is better than this over a flight (drag, sampling, an inertia that is a guess)."""
-TO_SIGMA = 1.4826
-"""From a median absolute deviation to a standard deviation."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +67,7 @@ def pose_noise(series: PoseSeries) -> Noise:
     turning = np.diff(states.spin_object_rad_s[1:], axis=0) * dt[1:]
     if len(sideways) < 3:
         return Noise(LEAST_SIGMA_M, LEAST_SIGMA_RAD)
-    position, rotation = (TO_SIGMA * float(np.median(np.abs(x))) / 6**0.5 for x in (sideways, turning))
+    position, rotation = (MAD_TO_SIGMA * float(np.median(np.abs(x))) / 6**0.5 for x in (sideways, turning))
     return Noise(max(position, LEAST_SIGMA_M), max(rotation, LEAST_SIGMA_RAD))
 
 

@@ -23,13 +23,13 @@ from scipy.linalg import cho_solve_banded, cholesky_banded
 
 from processing.motion.phases import Noise, Phases, find_phases, pose_noise
 from processing.motion.trajectory import (
-    GRAVITY_M_S2,
     PoseSeries,
     States,
     differences,
     rotation_matrices,
     rotation_vectors,
 )
+from recordings.constants import GRAVITY_M_S2
 
 FLIGHT_CHANGE_M_S, FLIGHT_CHANGE_RAD_S = 0.004, 0.05
 """What free flight may leave unexplained in the velocities of neighbouring frames (drag, an inertia that is a

@@ -15,11 +15,10 @@ from jaxtyping import Bool, Float, Int, Int64
 from numpy import ndarray as Array
 from scipy.spatial.transform import Rotation
 
+from recordings.constants import GRAVITY_M_S2
 from recordings.errors import BadInput
 from recordings.records import StampedPose
 from recordings.tracks import ObjectTrack, RigCalibration
-
-GRAVITY_M_S2 = 9.81
 
 
 @dataclass(frozen=True, eq=False)

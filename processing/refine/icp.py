@@ -15,7 +15,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32
 from numpy import ndarray as Array
 
+from processing.sensor import noise
+from recordings.constants import MAD_TO_SIGMA
 from recordings.geometry import CameraModel, rotation_exp, skew
+from recordings.robust import tukey_weight
 from recordings.tracks import ObjectShape
 
 LEAST_SIGMA = (0.002, 0.0003)
@@ -42,10 +45,9 @@ class IcpConfig:
     most_translation_m: float = 0.02
     observable: float = 0.02
     """A direction whose eigenvalue is below this share of the best-constrained one's is not observable."""
-    least_noise_m: float = 0.0008
+    least_noise_m: float = noise.ICP_LEAST_SIGMA_M
     """Depth is never trusted more than this, however well the shape fits."""
-    points_per_measurement: float = 300.0
-    """Depth errors are alike over a patch of pixels: so many points weigh as one independent measurement."""
+    points_per_measurement: float = noise.ICP_POINTS_PER_MEASUREMENT
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,9 +185,9 @@ def _solve(
     """
     if use.sum() < 6:
         return np.zeros(6), 6
-    weight = np.where(use, (1 - (gap / reach_m) ** 2) ** 2, 0.0)
+    weight = np.where(use, tukey_weight(gap / reach_m), 0.0)
     jacobian = np.concatenate([np.cross(arm, normal) / radius_m, normal], -1)
-    noise_m = max(1.4826 * float(np.median(np.abs(gap[use]))), config.least_noise_m)
+    noise_m = max(MAD_TO_SIGMA * float(np.median(np.abs(gap[use]))), config.least_noise_m)
     share = 1 / (noise_m**2 * config.points_per_measurement)
     depth = share * (weight[:, None] * jacobian).T @ jacobian
     information = depth + known

@@ -33,6 +33,7 @@ from processing.refine.joint_terms import (
     shape_block,
     views_block,
 )
+from processing.sensor import noise
 from recordings.geometry import rotation_exp
 from recordings.tracks import ObjectShape
 
@@ -47,7 +48,7 @@ class JointConfig:
     """How far vision's surface may be off locally."""
     shape_reach: float = 0.12
     """Reach of a control point, as a share of the shape's mean extent."""
-    points_per_measurement: float = 100.0
+    points_per_measurement: float = noise.JOINT_POINTS_PER_MEASUREMENT
     """Depth errors are alike over patches and from frame to frame, and `views` has seen them once: so many samples
     weigh as one independent measurement."""
     most_turn_rad: float = 0.05

@@ -16,17 +16,14 @@ from scipy.spatial import cKDTree
 
 from processing.contact.physics.support import trimmed_hull
 from processing.refine.icp import ShapeSurface
+from processing.sensor import noise
+from recordings.constants import GRAVITY_M_S2, MAD_TO_SIGMA
 from recordings.geometry import rotation_log, skew
+from recordings.robust import TUKEY_95, tukey_weight
 from recordings.tracks import ObjectShape
 
-GRAVITY_M_S2 = 9.81
-TO_SIGMA = 1.4826
-"""From a median absolute deviation to a standard deviation."""
-LEAST_DEPTH_M = 0.0005
 LEAST_M, LEAST_RAD = 1e-4, 1e-3
 LEAST_PLANE_M = 0.0005
-CONTACTS_PER_MEASUREMENT = 12.0
-"""Points that touch the plane in neighbouring frames, or while the object lies there, measure its height once."""
 REACH_M = 0.008
 """Depth further than this from the surface is something else."""
 
@@ -50,12 +47,11 @@ def _dense(name: str, residual: Array, weight: Array, columns: Array, values: Ar
 
 
 def _spread(residual: Float[Array, "*n"], least: float) -> float:
-    return max(TO_SIGMA * float(np.median(np.abs(residual))), least) if residual.size else least
+    return max(MAD_TO_SIGMA * float(np.median(np.abs(residual))), least) if residual.size else least
 
 
 def _tukey(residual: Float[Array, " n"], sigma: float) -> Float[Array, " n"]:
-    share = np.clip(np.abs(residual) / (4.685 * sigma), 0, 1)
-    return np.asarray((1 - share**2) ** 2 / sigma**2)
+    return np.asarray(tukey_weight(residual / (TUKEY_95 * sigma)) / sigma**2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,7 +123,7 @@ def depth_block(
     gap = ((points - nearest) * normal).sum(1)
     use = facing & (np.abs(gap) < REACH_M)
     points, nearest, normal, gap = points[use], nearest[use], normal[use], gap[use]
-    weight = _tukey(gap, _spread(gap, LEAST_DEPTH_M)) / points_per_measurement
+    weight = _tukey(gap, _spread(gap, noise.JOINT_LEAST_SIGMA_M)) / points_per_measurement
     pose = np.concatenate([-np.cross(points - center_m, normal), -normal], 1)
     near, pull = controls.weights(nearest)
     columns = np.concatenate([np.tile(6 * frame + np.arange(6), (len(gap), 1)), first + near], 1)
@@ -241,7 +237,7 @@ def plane_block(
     pose = np.concatenate([np.cross(corners[corner] - center_m, up), up], 1)
     grows = (up * along[corner]).sum(1)[:, None] * pull[corner]
     columns = np.concatenate([6 * frame[:, None] + np.arange(6), first + near[corner]], 1)
-    weight = _tukey(residual, _spread(residual, LEAST_PLANE_M)) / CONTACTS_PER_MEASUREMENT
+    weight = _tukey(residual, _spread(residual, LEAST_PLANE_M)) / noise.JOINT_CONTACTS_PER_MEASUREMENT
     return _dense("plane", residual, weight, columns, np.concatenate([pose, grows], 1))
 
 

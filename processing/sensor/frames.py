@@ -1,47 +1,34 @@
-"""The frames that tracking and the field look at: as recorded, with the depth camera's scale taken out."""
+"""The frames that vision looks at, and in which depth: as the camera reports it, or in true metres.
+
+Masks and the static scene are made from reported depth (`Session.toss(t).rgbd`), which they compare with itself; all
+that comes after them takes `metric_frames`. See docs/decisions/two-depths.md.
+"""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
-from processing.segment.background.depth_scale import corrected_depth
-from processing.sensor.still import whole_session
-from processing.stages.masks import static_scene
-from processing.stages.rig import CAMERA, Rig, rig_stage
+import numpy as np
+from jaxtyping import Float32
+from numpy import ndarray as Array
+
 from recordings.records import RgbdFrame
 from recordings.session import RgbdFrames
 
-if TYPE_CHECKING:
-    from processing.pipeline import Run
 
-
-def corrected_frames(run: Run, toss: int) -> RgbdFrames:
-    """A toss's frames, decoded when asked for, with depth in true metres: reported / scale (see processing.stages.rig).
-
-    Runs the stages `scene` and `rig`, or reads them. Where the scale is not significantly another, depth stays.
-    What depends on these frames depends on the stage `rig`; masks carry its key.
-    """
-    return with_depth_scale(run.session.toss(toss).rgbd(CAMERA), depth_scale(run))
-
-
-def every_frame(run: Run, toss: int) -> RgbdFrames:
-    """The same of every frame that was recorded, where the run works on some of them only (see processing.sensor.still)."""
-    return with_depth_scale(whole_session(run.session).toss(toss).rgbd(CAMERA), depth_scale(run))
-
-
-def depth_scale(run: Run) -> float:
-    """Reported / true depth, as used: 1.0 where nothing significant is known."""
-    return Rig.read(rig_stage(run, static_scene(run)).folder).depth_scale
-
-
-def with_depth_scale(frames: RgbdFrames, scale: float) -> RgbdFrames:
-    """The same frames with depth divided by `scale`; the very same where it is 1."""
+def metric_frames(reported: RgbdFrames, scale: float) -> RgbdFrames:
+    """The same frames, decoded when asked for, with depth divided by `scale` (reported / true depth, see the stage
+    `rig`); the very same frames where it is 1."""
     if scale == 1.0:
-        return frames
+        return reported
 
     def load(i: int) -> RgbdFrame:
-        frame = frames[i]
+        frame = reported[i]
         return replace(frame, depth_m=corrected_depth(frame.depth_m, scale))
 
-    return RgbdFrames(frames.times_ns, load, frames.depth_times_ns, frames.without_depth, frames.unused_depth)
+    return RgbdFrames(reported.times_ns, load, reported.depth_times_ns, reported.without_depth, reported.unused_depth)
+
+
+def corrected_depth(depth_m: Float32[Array, "h w"], scale: float) -> Float32[Array, "h w"]:
+    """True depth of what a camera with this scale reports; 0 stays 0."""
+    return depth_m if scale == 1.0 else (depth_m / np.float32(scale)).astype(np.float32)

@@ -8,10 +8,11 @@ from jaxtyping import Bool, Float32, UInt8
 from numpy import ndarray as Array
 
 
-class Exposure:
+class PhotometricGain:
     """Brightness of each frame against the first, from pixels that belong to the object in neither (median of ratios).
 
-    1 where the background tells nothing. The response is not linear: a ratio of stored values serves small gains well.
+    1 where the background shows too little. The response is not linear: a ratio of stored values serves small gains
+    well.
     """
 
     def __init__(self, step: int = 8) -> None:

@@ -13,7 +13,7 @@ from recordings.geometry import CameraModel
 
 
 @dataclass(frozen=True, eq=False)
-class Optics:
+class Rectification:
     """A camera as an ideal pinhole, with the maps that undo its distortion (None where it has none)."""
 
     camera: CameraModel
@@ -21,13 +21,13 @@ class Optics:
     map_v: Float32[Array, "h w"] | None
 
     @staticmethod
-    def of(camera: CameraModel) -> Optics:
+    def of(camera: CameraModel) -> Rectification:
         if camera.distortion_model == "none":
-            return Optics(camera, None, None)
+            return Rectification(camera, None, None)
         u, v = np.meshgrid(np.arange(camera.width, dtype=np.float64), np.arange(camera.height, dtype=np.float64))
         rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], -1)
         pixels = np.nan_to_num(camera.project(rays), nan=-1e4)
-        return Optics(camera, pixels[..., 0].astype(np.float32), pixels[..., 1].astype(np.float32))
+        return Rectification(camera, pixels[..., 0].astype(np.float32), pixels[..., 1].astype(np.float32))
 
     @property
     def focal(self) -> Float[Array, "2"]:

@@ -2,34 +2,26 @@
 
 A take that goes on while the object lies still shows the same image again and again. Such a stretch keeps a few frames
 at its ends; masks, tracks and shapes are made from what is kept, and at the end every frame left out gets the mask and
-the pose (with its covariance and status) of the kept frame that it looks like. Told from the images alone.
+the pose (with its covariance and status) of the kept frame that it looks like. Found from the images alone.
 """
 
 from __future__ import annotations
 
 import hashlib
-import json
-import shutil
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, Int64
+from jaxtyping import Float32, Int64
 from numpy import ndarray as Array
 
-from processing.store import Counts, Done
+from recordings.constants import MAD_TO_SIGMA
 from recordings.given_masks import GivenMasks
 from recordings.progress import Progress
 from recordings.records import RgbdFrame
-from recordings.results.folder import RobotMasks, read_masks, read_track, write_masks, write_track
 from recordings.session import RgbdFrames, Session, Toss
 from recordings.tracks import RigCalibration
-
-if TYPE_CHECKING:
-    from processing.pipeline import Run
 
 
 @dataclass(frozen=True)
@@ -130,7 +122,7 @@ def _noise(blocks: Sequence[_Blocks], settings: StillSettings) -> tuple[float, f
 
 def _spread(values: Float32[Array, "..."]) -> float:
     known = values[np.isfinite(values)]
-    return 1.4826 * float(np.median(np.abs(known))) if len(known) else float("nan")
+    return MAD_TO_SIGMA * float(np.median(np.abs(known))) if len(known) else float("nan")
 
 
 def _difference(one: _Blocks, other: _Blocks) -> tuple[Float32[Array, "b c 3"], Float32[Array, "b c"]]:
@@ -148,7 +140,7 @@ def _in_light_of(one: Float32[Array, "b c"], other: Float32[Array, "b c"]) -> Fl
             break
         gain, offset = np.polyfit(other[use], one[use], 1)
         off = np.abs(gain * other + offset - one)
-        use = np.isfinite(off) & (off <= 3 * 1.4826 * np.nanmedian(off) + 1e-3)
+        use = np.isfinite(off) & (off <= 3 * MAD_TO_SIGMA * np.nanmedian(off) + 1e-3)
     return (gain * other + offset).astype(np.float32)
 
 
@@ -169,7 +161,7 @@ class _ThinnedToss(Toss):
         self._kept = kept
 
     def rgbd(self, camera: str = "d455") -> RgbdFrames:
-        """The kept frames of the camera that the stretches were told from."""
+        """The kept frames of the camera that the stretches were found from."""
         frames, at = super().rgbd(camera), self._kept.positions
         without = tuple(int(i) for i in np.flatnonzero(np.isin(at, frames.without_depth)))
         return RgbdFrames(frames.times_ns[at], lambda i: frames[int(at[i])], frames.depth_times_ns[at], without,
@@ -199,70 +191,3 @@ class ThinnedSession(Session):
 def whole_session(session: Session) -> Session:
     """The session with every frame that was recorded."""
     return session.whole if isinstance(session, ThinnedSession) else session
-
-
-def without_waiting(run: Run) -> Run:
-    """The run with few frames of every still stretch; the very same run where there is none."""
-    kept = {t: k for t in run.tosses if (k := _kept_stage(run, t)) is not None}
-    if not kept:
-        return run
-    keys = {f"toss_{t:02d}": hashlib.sha256((run.keys[f"toss_{t:02d}"] + k.digest).encode()).hexdigest()
-            for t, k in kept.items()}  # fmt: skip
-    return replace(run, session=ThinnedSession(run.session, kept), keys={**run.keys, **keys}, kept=kept)
-
-
-def _kept_stage(run: Run, toss: int) -> Kept | None:
-    """Stage `still` of one toss; None where all its frames are worked on."""
-    frames, settings, name = run.session.toss(toss).rgbd(run.camera.frame), run.config.still, f"toss_{toss:02d}"
-    if len(frames) < settings.least:
-        return None
-
-    def compute(folder: Path) -> Counts:
-        found = still_stretches(frames, settings, run.progress(f"toss {toss}: what moves"))
-        kept = kept_of(found, len(frames), settings)
-        document = {"positions": kept.positions.tolist(), "like": kept.like.tolist()}
-        (folder / "still.json").write_text(json.dumps(document) + "\n")
-        return {"frames": len(frames), "kept": len(kept.positions), "stretches": [list(s) for s in found]}
-
-    done = run.store.run("still", 1, settings, {name: run.keys[name]}, compute)
-    if done.counts["kept"] == done.counts["frames"]:
-        return None
-    stored = json.loads((done.folder / "still.json").read_text())
-    return Kept(*(np.array(stored[k], dtype=np.int64) for k in ("positions", "like")))
-
-
-def in_every_frame(run: Run, toss: int, done: Done) -> Done:
-    """A stage's track and masks of one toss in every frame that was recorded (stage `every-frame`)."""
-    if toss not in run.kept:
-        return done
-    kept, frames = run.kept[toss], whole_session(run.session).toss(toss).rgbd(run.camera.frame)
-    stem = f"toss_{toss:02d}"
-
-    def compute(folder: Path) -> Counts:
-        if (done.folder / f"{stem}.track.npz").exists():
-            track = read_track(done.folder, toss)
-            status = tuple(track.status[i] for i in kept.like)
-            poses, covariance = (x[kept.like] for x in (track.camera_from_object, track.covariance))
-            write_track(folder, replace(track, time_ns=frames.times_ns, camera_from_object=poses, status=status,
-                                        covariance=covariance))  # fmt: skip
-        if (done.folder / f"{stem}.masks").exists():
-            seen = read_masks(done.folder, toss)
-            write_masks(folder, toss, list(_masks(seen, kept)), seen.confidence[kept.like])
-            _copy_robot(RobotMasks.of(done.folder, toss), folder / f"{stem}.robot", kept)
-        return {"frames": len(kept.like), "worked_on": len(kept.positions)}
-
-    return run.store.run("every-frame", 1, {"toss": toss}, {"thinned": done.key, "kept": kept.digest}, compute)
-
-
-def _masks(seen: Sequence[Bool[Array, "h w"]], kept: Kept) -> Iterator[Bool[Array, "h w"]]:
-    for i in kept.like:
-        yield seen[int(i)]
-
-
-def _copy_robot(robot: RobotMasks | None, to: Path, kept: Kept) -> None:
-    if robot is None:
-        return
-    to.mkdir()
-    for position, i in enumerate(kept.like):
-        if (source := robot.folder / f"{i:06d}.png").exists():
-            shutil.copyfile(source, to / f"{position:06d}.png")

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float, Float32
 from numpy import ndarray as Array
 
+from recordings.constants import MAD_TO_SIGMA
 from recordings.errors import BadInput
 from recordings.geometry import CameraModel, Transform
 from recordings.tracks import RigCalibration
@@ -67,7 +68,8 @@ def with_table_from_depth(
         )
     if offset > 0:  # the normal points to the camera, which lies at the origin
         normal, offset = -normal, -offset
-    spread_m = float(1.4826 * np.median(np.abs(points @ normal - offset)[np.abs(points @ normal - offset) < NEAR_M]))
+    gap_m = np.abs(points @ normal - offset)
+    spread_m = float(MAD_TO_SIGMA * np.median(gap_m[gap_m < NEAR_M]))
     found = {"share": round(share, 3), "spread_m": round(spread_m, 5), "source": "depth of the empty scene"}
     known = calibration.find("world", camera_name)
     if known is None:

@@ -1,4 +1,4 @@
-"""What one frame shows of the object, made ready for alignment: smooth depth, normals, looks, outline, samples.
+"""What one frame shows of the object, made ready for alignment: smooth depth, normals, appearance, outline, samples.
 
 All views of a toss lie in flat arrays (see kernels.py), so that any view can serve as the model for any other: the
 growing model is the set of views at their poses. Nothing is averaged away, nothing limits the object's size, and a
@@ -14,8 +14,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int64
 from numpy import ndarray as Array
 
-from processing.sensor.rectification import Optics
-from processing.track import kernels as k
+from processing.sensor import view_layout as lay
+from processing.sensor.rectification import Rectification
+from processing.sensor.surface_kernel import fit_surface
+from recordings.constants import LUMA
 from recordings.records import RgbdFrame
 
 
@@ -33,14 +35,15 @@ class ViewConfig:
     """Blur of the smooth grey level, which widens the basin of attraction."""
     rim_px: float = 2.0
     rim_share: float = 0.05
-    """Looks so near to the outline (pixels; at most this share of the object's size) are mixed with the background's by
-    optics and JPEG: they would stay with the picture. Those farther inside are blurred outwards over them."""
+    """Appearance so near to the outline (pixels; at most this share of the object's size) is mixed with the
+    background's by the lens and JPEG: it would stay with the picture. That farther inside is blurred outwards over
+    them."""
     shade_px: float = 5.0
     """Scale over which brightness is levelled: shading and exposure are no texture."""
     bright_gain: float = 0.5
     """Of levelled brightness: shadows and highlights stay with the room and mislead."""
     color_gain: float = 3.0
-    """Of colour differences: shading leaves them alone, so that a faint one tells more than a strong shadow."""
+    """Of colour differences: shading leaves them alone, so that a faint one counts more than a strong shadow."""
     jump_m: float = 0.015
     """A step of depth inside the outline (beyond a slope's): near it, the far surface gets the near one's depth ..."""
     jump_px: int = 3
@@ -79,7 +82,7 @@ def cut(
     frame: RgbdFrame,
     mask: Bool[Array, "h w"],
     position: int,
-    optics: Optics,
+    rectified: Rectification,
     gain: float,
     config: ViewConfig,
     camera_from_world: Float[Array, "4 4"] | None = None,
@@ -87,7 +90,7 @@ def cut(
 ) -> Crop | None:
     """The crop around the mask, or None where the mask holds too little. `camera_from_world` has the table at z = 0;
     `colorless` marks pixels of the mask that show something else's colour."""
-    straight_mask = optics.straight(mask.astype(np.uint8), smooth=False) > 0
+    straight_mask = rectified.straight(mask.astype(np.uint8), smooth=False) > 0
     rows, columns = np.flatnonzero(straight_mask.any(1)), np.flatnonzero(straight_mask.any(0))
     h, w = straight_mask.shape
     if len(rows) == 0 or int(straight_mask.sum()) < config.least_samples:
@@ -95,20 +98,20 @@ def cut(
     top, bottom = max(int(rows[0]) - config.margin_px, 0), min(int(rows[-1]) + config.margin_px + 1, h)
     left, right = max(int(columns[0]) - config.margin_px, 0), min(int(columns[-1]) + config.margin_px + 1, w)
     area = np.s_[top:bottom, left:right]
-    color = optics.straight(frame.color_rgb, smooth=True)[area].astype(np.float32) / np.float32(255.0 * gain)
-    depth_m = np.ascontiguousarray(optics.straight(frame.depth_m, smooth=False)[area])
+    color = rectified.straight(frame.color_rgb, smooth=True)[area].astype(np.float32) / np.float32(255.0 * gain)
+    depth_m = np.ascontiguousarray(rectified.straight(frame.depth_m, smooth=False)[area])
     inside = np.ascontiguousarray(straight_mask[area])
-    height_m = _heights(depth_m, (left, top), optics, camera_from_world)
+    height_m = _heights(depth_m, (left, top), rectified, camera_from_world)
     covered = _covered(depth_m, inside, height_m, config)
     delay_s = (frame.depth_time_ns - frame.time_ns) * 1e-9
-    foreign = None if colorless is None else optics.straight(colorless.astype(np.uint8), smooth=False)[area] > 0
+    foreign = None if colorless is None else rectified.straight(colorless.astype(np.uint8), smooth=False)[area] > 0
     return Crop(position, (int(left), int(top)), inside, depth_m, color, covered, height_m, delay_s, foreign)
 
 
 def _heights(
     depth_m: Float32[Array, "h w"],
     corner: tuple[int, int],
-    optics: Optics,
+    rectified: Rectification,
     camera_from_world: Float[Array, "4 4"] | None,
 ) -> Float32[Array, "h w"] | None:
     """Height above the table of every pixel; None where the table is not known."""
@@ -116,8 +119,8 @@ def _heights(
         return None
     up = camera_from_world[:3, 2]
     v, u = np.indices(depth_m.shape)
-    x = (u + corner[0] - optics.camera.cx) / optics.camera.fx
-    y = (v + corner[1] - optics.camera.cy) / optics.camera.fy
+    x = (u + corner[0] - rectified.camera.cx) / rectified.camera.fx
+    y = (v + corner[1] - rectified.camera.cy) / rectified.camera.fy
     height = depth_m * (up[0] * x + up[1] * y + up[2]) - up @ camera_from_world[:3, 3]
     return height.astype(np.float32)
 
@@ -152,33 +155,35 @@ class View:
 
     @property
     def center_m(self) -> Float[Array, "3"]:
-        """Middle of the seen surface, camera frame."""
+        """Center of the seen surface, camera frame."""
         return np.asarray(np.median(self.samples[:, :3], axis=0), dtype=np.float64)
 
 
-def make_view(crop: Crop, optics: Optics, config: ViewConfig, motion: Float[Array, "4 4"] | None = None) -> View | None:
-    """Depth made smooth, normals, levelled looks, distance to the outline, samples.
+def make_view(
+    crop: Crop, rectified: Rectification, config: ViewConfig, motion: Float[Array, "4 4"] | None = None
+) -> View | None:
+    """Depth made smooth, normals, levelled appearance, distance to the outline, samples.
 
     `motion` (4x4, camera frame) moves the object from its place at depth's exposure to that at colour's; None: at rest.
     None is returned where too few points are left.
     """
-    depth_m = _cleaned(crop, config) if motion is None else _moved_depth(crop, optics, motion, config)
+    depth_m = _cleaned(crop, config) if motion is None else _moved_depth(crop, rectified, motion, config)
     inside = cv2.erode(crop.mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     h, w = crop.mask.shape
-    pixels = np.zeros((h, w, k.CHANNELS), dtype=np.float32)
-    rays = _ray_steps(crop.corner, optics)
+    pixels = np.zeros((h, w, lay.CHANNELS), dtype=np.float32)
+    rays = _ray_steps(crop.corner, rectified)
     smooth_m, normals = np.zeros((h, w), dtype=np.float32), np.zeros((h, w, 3), dtype=np.float32)
-    k.fit_surface(depth_m, inside, rays, config.window_px, config.edge_share, smooth_m, normals)
-    pixels[..., k.Z], pixels[..., k.NX : k.NZ + 1] = smooth_m, normals
+    fit_surface(depth_m, inside, rays, config.window_px, config.edge_share, smooth_m, normals)
+    pixels[..., lay.Z], pixels[..., lay.NX : lay.NZ + 1] = smooth_m, normals
     outside = cv2.distanceTransform((~crop.mask).astype(np.uint8), cv2.DIST_L2, 5)
-    pixels[..., k.OUTSIDE] = np.where(crop.covered, k.HIDDEN, outside)
-    pixels[..., k.SHARP :] = _looks(crop, config)
+    pixels[..., lay.OUTSIDE] = np.where(crop.covered, lay.HIDDEN, outside)
+    pixels[..., lay.SHARP :] = _appearance(crop, config)
     samples = _samples(pixels, rays, config, crop.position)
     return View(crop.position, crop.corner, pixels, samples) if len(samples) >= config.least_samples else None
 
 
-def _ray_steps(corner: tuple[int, int], optics: Optics) -> Float[Array, "4"]:
-    c = optics.camera
+def _ray_steps(corner: tuple[int, int], rectified: Rectification) -> Float[Array, "4"]:
+    c = rectified.camera
     return np.array([1 / c.fx, 1 / c.fy, (corner[0] - c.cx) / c.fx, (corner[1] - c.cy) / c.fy])
 
 
@@ -197,9 +202,11 @@ def _near_bulk(depth_m: Float32[Array, "h w"], inside: Bool[Array, "h w"]) -> Bo
     return np.asarray(np.abs(depth_m - middle) < reach)
 
 
-def _moved_depth(crop: Crop, optics: Optics, motion: Float[Array, "4 4"], config: ViewConfig) -> Float32[Array, "h w"]:
+def _moved_depth(
+    crop: Crop, rectified: Rectification, motion: Float[Array, "4 4"], config: ViewConfig
+) -> Float32[Array, "h w"]:
     """Depth as it would have been at colour's exposure: the object's points moved, then seen again (nearest wins)."""
-    dx, dy, x0, y0 = _ray_steps(crop.corner, optics)
+    dx, dy, x0, y0 = _ray_steps(crop.corner, rectified)
     depth_m = crop.depth_m.copy()
     h, w = depth_m.shape
     center = crop.depth_m[crop.mask & (crop.depth_m > 0)]
@@ -207,7 +214,7 @@ def _moved_depth(crop: Crop, optics: Optics, motion: Float[Array, "4 4"], config
         return np.zeros_like(depth_m)
     z = float(np.median(center))
     shift_px = motion[:2, :3] @ [0, 0, z] + motion[:2, 3]
-    reach = int(np.ceil(np.abs(shift_px).max() / z * optics.camera.fx)) + 2
+    reach = int(np.ceil(np.abs(shift_px).max() / z * rectified.camera.fx)) + 2
     grown = cv2.dilate(crop.mask.astype(np.uint8), np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)) > 0
     use = grown & (depth_m > 0) & _near_bulk(depth_m, crop.mask & (depth_m > 0))
     if crop.height_m is not None:
@@ -223,7 +230,7 @@ def _moved_depth(crop: Crop, optics: Optics, motion: Float[Array, "4 4"], config
     return np.where(np.isfinite(out) & crop.mask, out, np.float32(0))
 
 
-def _looks(crop: Crop, config: ViewConfig) -> Float32[Array, "h w 6"]:
+def _appearance(crop: Crop, config: ViewConfig) -> Float32[Array, "h w 6"]:
     """Brightness divided by that around it (shading and shadows stay with the room, not with the object), and two
     differences of colour, each sharp and smooth."""
     color, mask = crop.color, crop.mask
@@ -232,18 +239,18 @@ def _looks(crop: Crop, config: ViewConfig) -> Float32[Array, "h w 6"]:
     own = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, 5) > rim_px
     weight = (own if foreign is None else own & ~foreign).astype(np.float32)
     red, green, blue = color[..., 0], color[..., 1], color[..., 2]
-    gray = 0.299 * red + 0.587 * green + 0.114 * blue
+    gray = LUMA[0] * red + LUMA[1] * green + LUMA[2] * blue
     total = red + green + blue + 0.1
-    looks = (
+    channels = (
         config.bright_gain * (gray / (_masked_blur(gray, weight, config.shade_px) + 0.03) - 1.0),
         config.color_gain * (red - green) / total,
         config.color_gain * (blue - 0.5 * (red + green)) / total,
     )
-    smooth = [_masked_blur(look, weight, config.smooth_px) for look in looks]
-    sharp = [np.where(own, look, blurred) for look, blurred in zip(looks, smooth)]
+    smooth = [_masked_blur(channel, weight, config.smooth_px) for channel in channels]
+    sharp = [np.where(own, channel, blurred) for channel, blurred in zip(channels, smooth)]
     out = np.stack([*sharp, *smooth], -1).astype(np.float32)
     if foreign is not None:
-        out[foreign & mask] = k.NO_LOOK
+        out[foreign & mask] = lay.NO_APPEARANCE
     return out
 
 
@@ -266,17 +273,17 @@ def _near_jumps(depth_m: Float32[Array, "h w"], slope: float, config: ViewConfig
 def _samples(
     pixels: Float32[Array, "h w c"], rays: Float[Array, "4"], config: ViewConfig, seed: int
 ) -> Float32[Array, "n s"]:
-    v, u = np.nonzero((pixels[..., k.Z] > 0) & ~_near_jumps(pixels[..., k.Z], 5.0 * float(rays[0]), config))
+    v, u = np.nonzero((pixels[..., lay.Z] > 0) & ~_near_jumps(pixels[..., lay.Z], 5.0 * float(rays[0]), config))
     order = np.random.default_rng(seed).permutation(len(u))[: config.samples]
     u, v = u[order], v[order]
     seen = pixels[v, u]
     directions = np.stack([rays[2] + rays[0] * u, rays[3] + rays[1] * v, np.ones(len(u))], -1)
-    points = directions * seen[:, k.Z, None]
-    return np.concatenate([points, seen[:, k.NX : k.NZ + 1], seen[:, k.SHARP :]], -1).astype(np.float32)
+    points = directions * seen[:, lay.Z, None]
+    return np.concatenate([points, seen[:, lay.NX : lay.NZ + 1], seen[:, lay.SHARP :]], -1).astype(np.float32)
 
 
 STILL_OUTLINE, STILL_PX, STILL_BRIGHTNESS = 0.96, 0.3, 0.03
-"""Overlap of outlines, shift of their middle and change of brightness of an object that stands still."""
+"""Overlap of outlines, shift of their center and change of brightness of an object that stands still."""
 
 
 def _on_common_ground(one: Crop, two: Crop) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
@@ -294,41 +301,41 @@ def _on_common_ground(one: Crop, two: Crop) -> tuple[tuple[Array, Array], tuple[
 class ViewStore:
     """The views of one or several tosses in the flat arrays that the kernels read."""
 
-    def __init__(self, optics: Optics, crops: list[Crop | None], config: ViewConfig) -> None:
+    def __init__(self, rectified: Rectification, crops: list[Crop | None], config: ViewConfig) -> None:
         sizes = [0 if c is None else int(c.mask.size) for c in crops]
-        self.optics, self.crops, self.config = optics, crops, config
-        self.maps = np.zeros((sum(sizes), k.CHANNELS), dtype=np.float32)
-        self.samples = np.zeros((config.samples * len(crops), k.SAMPLE), dtype=np.float32)
+        self.rectified, self.crops, self.config = rectified, crops, config
+        self.maps = np.zeros((sum(sizes), lay.CHANNELS), dtype=np.float32)
+        self.samples = np.zeros((config.samples * len(crops), lay.SAMPLE), dtype=np.float32)
         self.table: Int64[Array, "n 7"] = np.zeros((len(crops), 7), dtype=np.int64)
         self.center_m = np.full((len(crops), 3), np.nan)
         self.motion: list[Float[Array, "4 4"] | None] = [None] * len(crops)
         for i, offset in enumerate(np.cumsum([0, *sizes[:-1]]) if sizes else []):
-            self.table[i, k.OFFSET], self.table[i, k.FIRST] = offset, i * config.samples
+            self.table[i, lay.OFFSET], self.table[i, lay.FIRST] = offset, i * config.samples
 
     def __len__(self) -> int:
         return len(self.crops)
 
     def usable(self, i: int) -> bool:
-        return bool(self.table[i, k.COUNT] > 0)
+        return bool(self.table[i, lay.COUNT] > 0)
 
     def fill(self, i: int, motion: Float[Array, "4 4"] | None = None) -> bool:
         """Make view i (again), with the object's motion from depth's to colour's exposure. False: nothing to see."""
         crop = self.crops[i]
-        view = None if crop is None else make_view(crop, self.optics, self.config, motion)
-        self.table[i, k.COUNT] = 0
+        view = None if crop is None else make_view(crop, self.rectified, self.config, motion)
+        self.table[i, lay.COUNT] = 0
         if view is None or crop is None:
             return False
         h, w = crop.mask.shape
-        offset, first, n = int(self.table[i, k.OFFSET]), int(self.table[i, k.FIRST]), len(view.samples)
-        self.maps[offset : offset + h * w] = view.pixels.reshape(-1, k.CHANNELS)
+        offset, first, n = int(self.table[i, lay.OFFSET]), int(self.table[i, lay.FIRST]), len(view.samples)
+        self.maps[offset : offset + h * w] = view.pixels.reshape(-1, lay.CHANNELS)
         self.samples[first : first + n] = view.samples
-        self.table[i, [k.U0, k.V0, k.WIDTH, k.HEIGHT, k.COUNT]] = [*view.corner, w, h, n]
+        self.table[i, [lay.U0, lay.V0, lay.WIDTH, lay.HEIGHT, lay.COUNT]] = [*view.corner, w, h, n]
         self.center_m[i] = view.center_m
         self.motion[i] = motion
         return True
 
     def stands_still(self, i: int, j: int) -> bool:
-        """Whether the object has not moved between two frames, as far as its outline and brightness tell."""
+        """Whether the object has not moved between two frames, as far as its outline and brightness show."""
         one, two = self.crops[i], self.crops[j]
         if one is None or two is None or max(np.abs(np.subtract(one.corner, two.corner))) > 3:
             return False
@@ -342,14 +349,14 @@ class ViewStore:
 
     def only(self, views: Int64[Array, " m"]) -> ViewStore:
         """The same store with some of its views alone (pixels copied)."""
-        out = ViewStore(self.optics, [self.crops[int(i)] for i in views], self.config)
+        out = ViewStore(self.rectified, [self.crops[int(i)] for i in views], self.config)
         for new, i in enumerate(views):
             crop, row = out.crops[new], self.table[i]
             size = 0 if crop is None else crop.mask.size
-            offset, first, n = int(out.table[new, k.OFFSET]), int(out.table[new, k.FIRST]), int(row[k.COUNT])
-            out.maps[offset : offset + size] = self.maps[row[k.OFFSET] : row[k.OFFSET] + size]
-            out.samples[first : first + n] = self.samples[row[k.FIRST] : row[k.FIRST] + n]
-            out.table[new, k.U0 : k.HEIGHT + 1], out.table[new, k.COUNT] = row[k.U0 : k.HEIGHT + 1], n
+            offset, first, n = int(out.table[new, lay.OFFSET]), int(out.table[new, lay.FIRST]), int(row[lay.COUNT])
+            out.maps[offset : offset + size] = self.maps[row[lay.OFFSET] : row[lay.OFFSET] + size]
+            out.samples[first : first + n] = self.samples[row[lay.FIRST] : row[lay.FIRST] + n]
+            out.table[new, lay.U0 : lay.HEIGHT + 1], out.table[new, lay.COUNT] = row[lay.U0 : lay.HEIGHT + 1], n
             out.center_m[new], out.motion[new] = self.center_m[i], self.motion[int(i)]
         return out
 
@@ -357,7 +364,7 @@ class ViewStore:
     def joined(stores: list[ViewStore]) -> ViewStore:
         """All views of several stores in one, in order; they must have one camera."""
         out = ViewStore.__new__(ViewStore)
-        out.optics, out.config = stores[0].optics, stores[0].config
+        out.rectified, out.config = stores[0].rectified, stores[0].config
         out.crops = [c for s in stores for c in s.crops]
         out.motion = [m for s in stores for m in s.motion]
         out.maps = np.concatenate([s.maps for s in stores])
@@ -366,8 +373,8 @@ class ViewStore:
         tables, pixels, samples = [], 0, 0
         for s in stores:
             table = s.table.copy()
-            table[:, k.OFFSET] += pixels
-            table[:, k.FIRST] += samples
+            table[:, lay.OFFSET] += pixels
+            table[:, lay.FIRST] += samples
             pixels, samples = pixels + len(s.maps), samples + len(s.samples)
             tables.append(table)
         out.table = np.concatenate(tables)

@@ -1,5 +1,5 @@
-"""Passes compared by contact: shape, friction and inertia learned from one half of the tosses and judged on the other,
-both ways.
+"""Stage `held-out`: passes compared by contact, with shape, friction and inertia learned from one half of the tosses
+and judged on the other, both ways.
 
 A half takes the row's own way: the shape that contact corrects from this half alone goes into a second pass of its own,
 so nothing that contact told of the judged tosses is in the shape they are judged by. What all tosses showed the camera
@@ -9,15 +9,14 @@ is; and poses are the row's.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from scipy.optimize import minimize_scalar
 
-from processing.stages.contact import contact_stage
-from processing.stages.vision import CAMERA
-from processing.store import Counts, Done
+from processing.run import CAMERA, Run
+from processing.store import Done
 from recordings.errors import BadInput
 from recordings.geometry import Transform
 from recordings.results.folder import read_contact, read_shape, read_track
@@ -26,11 +25,22 @@ from recordings.tracks import ContactModel, ObjectShape, ObjectTrack
 
 if TYPE_CHECKING:
     from processing.contact.learn.shape_comparison import TossLoss
-    from processing.pipeline import Run
 
+VERSION = 4
 LEAST_TOSSES = 4
 """From which on there are halves: learned from fewer than two tosses, friction is hardly known."""
 ALONE = "passes are compared by images alone, not by the contact of tosses held out"
+HEIGHTS_M = (-0.004, 0.004)
+"""How far the plane may lie from where calibration has it."""
+
+
+@dataclass(frozen=True)
+class HeldOutResult:
+    """Contact loss (J) by toss and how far the plane was raised (m); or why there are none."""
+
+    loss_j: Mapping[str, float]
+    raised_m: float = 0.0
+    kept_out: str | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,19 +68,6 @@ def halves_of(tracks: Mapping[int, Done], shapes: Mapping[int, Done]) -> tuple[H
     return Half(first, second, shape), Half(second, first, shape)
 
 
-def learned_by(run: Run, halves: Sequence[Half], tracks: Mapping[int, Done], name: str) -> tuple[Half, ...]:
-    """Contact learned by each half from its own tosses. None of them where a half cannot learn: one alone would not
-    judge both ways."""
-    found = []
-    for half in halves:
-        own = {t: tracks[t] for t in half.learned_from}
-        learned = contact_stage(run, f"{name}, {half.name}", own, half.shape)
-        if learned.counts.get("kept_out"):
-            return ()
-        found.append(replace(half, contact=learned))
-    return tuple(found)
-
-
 def why_no_halves(tracks: Mapping[int, Done], losses: Mapping[int, float]) -> tuple[str, ...]:
     """What to say where no toss was held out."""
     if losses:
@@ -80,20 +77,16 @@ def why_no_halves(tracks: Mapping[int, Done], losses: Mapping[int, float]) -> tu
     return (f"contact cannot be learned from each half of the tosses: {ALONE}",)
 
 
-def held_out_losses(run: Run, name: str, tracks: Mapping[int, Done], halves: Sequence[Half]) -> dict[int, float]:
+def losses_of(judged: Sequence[Done[HeldOutResult]]) -> dict[int, float]:
     """Contact loss (J) of every toss by the half that did not learn from it; empty without halves, or where a half has
     no toss that can be used."""
-    found: dict[int, float] = {}
-    for half in halves:
-        losses = held_out_stage(run, name, tracks, half).counts.get("loss_j", {})
-        if not losses:
-            return {}
-        found |= {int(t): float(x) for t, x in losses.items()}
-    return dict(sorted(found.items()))
+    if not all(d.result.loss_j for d in judged):
+        return {}
+    return dict(sorted((int(t), float(x)) for d in judged for t, x in d.result.loss_j.items()))
 
 
-def held_out_stage(run: Run, name: str, tracks: Mapping[int, Done], half: Half) -> Done:
-    """Stage `held-out`: the contact loss of the judged tosses by a half's shape, friction and inertia.
+def judge_by_contact(run: Run, name: str, tracks: Mapping[int, Done], half: Half) -> Done[HeldOutResult]:
+    """The contact loss of the judged tosses by a half's shape, friction and inertia.
 
     At the height of the plane that suits the half's own tosses best: size and height are not identifiable together, and
     a shape that grew would else be charged for a plane that lies too high.
@@ -104,7 +97,7 @@ def held_out_stage(run: Run, name: str, tracks: Mapping[int, Done], half: Half) 
     inputs = {"shape": half.shape.key, "learned": learned.key, "judged": _listed(half.judged)}
     inputs |= {**{f"track_{t:02d}": d.key for t, d in tracks.items()}, "calibration": run.keys["calibration"]}
 
-    def compute(folder: Path) -> Counts:
+    def compute(folder: Path) -> HeldOutResult:
         run.progress(f"{name}: contact loss of tosses not learned from").step(0, 1, "")
         own, others = (
             {t: read_track(tracks[t].folder, t) for t in tosses} for tosses in (half.learned_from, half.judged)
@@ -115,15 +108,11 @@ def held_out_stage(run: Run, name: str, tracks: Mapping[int, Done], half: Half) 
             raised_m = best_height_m(own, shape, model, world_from_camera)
             losses = losses_at(raised_m, others, shape, model, world_from_camera)
         except BadInput as why:
-            return {"kept_out": str(why)}
+            return HeldOutResult({}, kept_out=str(why))
         write_json(folder / "losses.json", {str(t): asdict(x) for t, x in losses.items()})
-        return {"loss_j": {str(t): x.loss_j for t, x in losses.items()}, "raised_m": raised_m}
+        return HeldOutResult({str(t): x.loss_j for t, x in losses.items()}, raised_m)
 
-    return run.store.run("held-out", 3, {}, inputs, compute)
-
-
-HEIGHTS_M = (-0.004, 0.004)
-"""How far the plane may lie from where calibration has it."""
+    return run.store.run("held-out", VERSION, {}, inputs, HeldOutResult, compute)
 
 
 def best_height_m(

@@ -1,52 +1,60 @@
-"""The joint objective as a stage: its frames from the tracks, its outside from the calibration, its poses as tracks."""
+"""Stage `joint`: its frames from the tracks, its outside from the calibration, its poses as tracks."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray as Array
 
-from processing.field.learn import pose_at
+from processing.images import Images, TossImages, track_and_image_keys
+from processing.motion.interpolate import pose_at
 from processing.refine.joint import FrameData, JointConfig, World, solve_jointly
-from processing.stages.second_pass import input_keys
-from processing.stages.vision import CAMERA
-from processing.store import Counts, Done
+from processing.run import Run
+from processing.store import Done
 from processing.track.flags import camera_covariance
 from recordings.geometry import skew
 from recordings.records import RgbdFrame
-from recordings.results.folder import read_masks, read_shape, read_track, write_shape, write_track
+from recordings.results.folder import read_shape, read_track, write_shape, write_track
 from recordings.session_writer import write_json
 from recordings.tracks import ObjectShape, ObjectTrack
 
-if TYPE_CHECKING:
-    from processing.pipeline import Run
-
+VERSION = 3
 BORDER_PX = 2
 FEWEST_PX = 100
 
 
-def joint_stage(run: Run, tracks: Mapping[int, Done], shape: Done, masks: Mapping[int, Done]) -> Done:
-    """Stage `joint`: poses and shape of all tosses in one objective, from where a pass ended."""
-    inputs = {"shape": shape.key, "calibration": run.keys["calibration"], **input_keys(tracks, masks)}
+@dataclass(frozen=True)
+class JointResult:
+    """Frames that took part, whether gravity and the table did; or why there was nothing to solve."""
 
-    def compute(folder: Path) -> Counts:
+    frames: int
+    world: bool = False
+    kept_out: str | None = None
+
+
+def solve_together(
+    run: Run, tracks: Mapping[int, Done], shape: Done, images: Mapping[int, Images]
+) -> Done[JointResult]:
+    """Poses and shape of all tosses in one objective, from where a pass ended."""
+    inputs = {**track_and_image_keys(tracks, images), "shape": shape.key, "calibration": run.keys["calibration"]}
+
+    def compute(folder: Path) -> JointResult:
         body, progress = read_shape(shape.folder), run.progress("joint objective")
         before = {t: read_track(d.folder, t) for t, d in tracks.items()}
         frames: list[FrameData] = []
         for done, (toss, track) in enumerate(before.items()):
             progress.step(done, len(before) + 1, f"toss {toss}")
-            frames += frames_of(run, track, masks[toss], run.config.joint)
+            frames += frames_of(run, track, images[toss].open(), run.config.joint)
         if not frames:
             write_shape(folder, body)
             for track in before.values():
                 write_track(folder, track)
-            return {"frames": 0, "kept_out": f"no tracked frame shows {FEWEST_PX} pixels: nothing to solve jointly"}
+            return JointResult(0, kept_out=f"no tracked frame shows {FEWEST_PX} pixels: nothing to solve jointly")
         poses = np.stack([before[f.toss].camera_from_object[f.position] for f in frames])
         world = outside(run, before, frames, body)
         found = solve_jointly(frames, poses, body, world, run.config.joint)
@@ -55,23 +63,23 @@ def joint_stage(run: Run, tracks: Mapping[int, Done], shape: Done, masks: Mappin
             mine = [i for i, f in enumerate(frames) if f.toss == toss]
             write_track(folder, _with_poses(track, frames, mine, found.poses, found.information, found.center_m))
         write_json(folder / "costs.json", {"rounds": list(found.costs)})
-        return {"frames": len(frames), "world": world is not None}
+        return JointResult(len(frames), world is not None)
 
-    return run.store.run("joint", 2, run.config.joint, inputs, compute)
+    return run.store.run("joint", VERSION, run.config.joint, inputs, JointResult, compute)
 
 
-def frames_of(run: Run, track: ObjectTrack, masks: Done, config: JointConfig) -> list[FrameData]:
+def frames_of(run: Run, track: ObjectTrack, seen: TossImages, config: JointConfig) -> list[FrameData]:
     """The tracked frames of one toss as the objective sees them."""
-    streams, seen, rays = run.frames(track.toss), read_masks(masks.folder, track.toss), run.camera.pixel_rays()
+    rays = run.camera.pixel_rays()
     out = []
     for i, status in enumerate(track.status):
-        mask = np.asarray(seen[i], dtype=bool)
+        mask = np.asarray(seen.masks[i], dtype=bool)
         if status != "tracked" or mask.sum() < FEWEST_PX:
             continue
         pose = track.camera_from_object[i]
-        at_depth = np.linalg.inv(pose) @ pose_at(track, i, int(streams.depth_times_ns[i]))
+        at_depth = np.linalg.inv(pose) @ pose_at(track, i, int(seen.depth_times_ns[i]))
         time_s = 1e-9 * float(track.time_ns[i] - track.time_ns[0])
-        out.append(_frame(track.toss, i, time_s, streams[i], mask, rays, at_depth, track.covariance[i], config))
+        out.append(_frame(track.toss, i, time_s, seen.frames[i], mask, rays, at_depth, track.covariance[i], config))
     return out
 
 
@@ -91,13 +99,13 @@ def outside(run: Run, tracks: Mapping[int, ObjectTrack], frames: list[FrameData]
     """Gravity, plane, and which frames fly or rest; None without a calibrated world."""
     from processing.contact.learn.shape_comparison import series_of
     from processing.contact.physics.inertia import uniform_physics
-    from processing.contact.stage import session_plane
+    from processing.contact.physics.plane import calibrated_plane
     from processing.motion.phases import find_phases
 
-    world = run.session.calibration.find("world", CAMERA)
+    world = run.world_from_camera
     if world is None:
         return None
-    plane, physics = session_plane(run.session), uniform_physics(body)
+    plane, physics = calibrated_plane(run.session.calibration), uniform_physics(body)
     index = {(f.toss, f.position): k for k, f in enumerate(frames)}
     flights, rests, resting, released = [], [], [], []
     for toss, track in tracks.items():

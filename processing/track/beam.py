@@ -1,8 +1,8 @@
-"""Follows the object from frame to frame with several hypotheses, because one frame of a symmetric body does not tell.
+"""Follows the object from frame to frame with several hypotheses: one frame of a symmetric body leaves its pose open.
 
 Each hypothesis is a list of poses; its model is the views at those poses, so a new branch costs nothing. A frame's
-candidates (motion prior, shift of the cloud, feature matches, a grid of turns when all else fits badly) are aligned and
-ranked by how well they fit plus what the change of motion costs; the best few live on.
+candidates (motion prior, shift of the cloud, feature matches, a grid of rotations when all else fits badly) are aligned
+and ranked by the cost of the fit plus that of the change of motion; the best few live on.
 """
 
 from __future__ import annotations
@@ -14,22 +14,17 @@ from jaxtyping import Float, Int
 from numpy import ndarray as Array
 
 from processing.features.sift import FeatureMatcher, Features, RansacConfig, relative_motions
-from processing.motion.motion_prior import (
-    MotionConfig,
-    carried_on,
-    change_cost,
-    moved,
-    steady_spin,
-    turn_between,
-    turn_grid,
-)
+from processing.motion import se3_kernels as se3
+from processing.motion.interpolate import carried_on, moved, turn_between
+from processing.motion.motion_prior import MotionConfig, change_cost, steady_spin
+from processing.motion.rotation_grid import turn_grid
 from processing.sensor.view import ViewStore
 from processing.track import kernels as k
 from processing.track.keyframes import KeyframeConfig, is_new, references
 
 Schedule = tuple[tuple[int, int, float, float, float, float], ...]
-"""Rows of kernels.align_view: level (0 sharp, 1 smooth), steps, depth scale (m at 0.8 m), scale of the looks, outline
-scale (m at 0.8 m), share of the samples."""
+"""Rows of kernels.align_view: level (0 sharp, 1 smooth), steps, depth scale (m at 0.8 m), scale of the appearance,
+outline scale (m at 0.8 m), share of the samples."""
 
 USUAL_DISTANCE_M = 0.8
 LEAST_DELAY_S = 0.0003
@@ -47,10 +42,10 @@ class BeamConfig:
     coarse: Schedule = ((1, 6, 0.012, 0.5, 0.010, 0.15), (1, 4, 0.006, 0.4, 0.008, 0.3))
     fine: Schedule = ((0, 5, 0.004, 0.4, 0.006, 0.4), (0, 6, 0.0025, 0.3, 0.005, 1.0))
     grid: Schedule = ((1, 5, 0.012, 0.5, 0.010, 0.1),)
-    doubt: float = 0.07
+    uncertain_cost: float = 0.07
     """A frame whose best fit costs more asks for feature matches."""
     search: float = 0.13
-    """A frame whose best fit costs more even then asks for the grid of turns."""
+    """A frame whose best fit costs more even then asks for the grid of rotations."""
     lost: float = 0.33
     """A frame whose best fit costs more is no basis for others."""
     least_on_surface: float = 0.15
@@ -61,7 +56,7 @@ class BeamConfig:
     grid_deg: tuple[float, ...] = (20.0, 40.0, 65.0)
     grid_axes: int = 20
     hold: float = 60.0
-    """The pull towards the foretold pose weighs as much as so many independent samples ..."""
+    """The pull towards the predicted pose weighs as much as so many independent samples ..."""
     hold_deg: float = 2.0
     hold_m: float = 0.01
     """... of this standard deviation."""
@@ -74,7 +69,7 @@ class BeamConfig:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What the beam looks at: views, their times, gravity, where the body's middle is (object frame)."""
+    """What the beam reads: views, their times, gravity, where the body's center of mass is (object frame)."""
 
     store: ViewStore
     times_s: Float[Array, " n"]
@@ -89,7 +84,7 @@ class Scene:
         """How the hand moves from one frame to another (camera axes); None where that is not known."""
         if self.hand is None or not np.isfinite(self.hand[[before, now], 0, 0]).all():
             return None
-        return np.asarray(self.hand[now] @ k.inverse(self.hand[before]))
+        return np.asarray(self.hand[now] @ se3.inverse(self.hand[before]))
 
     def described(self, view: int) -> Features:
         if view not in self.features:
@@ -116,17 +111,17 @@ class Hypothesis:
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """One pose for one frame: what it costs to fit, with the price of the motion, and how much lies on the surface."""
+    """One pose for one frame: what it costs to fit, what its motion costs, and how much lies on the surface."""
 
     pose: Float[Array, "4 4"]
     fit: float
-    price: float
+    motion_cost: float
     on_surface: float
     source: str
 
     @property
     def cost(self) -> float:
-        return self.fit + self.price
+        return self.fit + self.motion_cost
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,12 +186,12 @@ def _put_at_color_time(scene: Scene, h: Hypothesis, i: int, config: BeamConfig) 
         moved(h.poses[a], h.poses[b], step_s, t - scene.times_s[b], scene.center_m, scene.gravity_camera_m_s2, spin)
         for t in (scene.times_s[i], scene.times_s[i] + crop.depth_delay_s)
     )
-    scene.store.fill(i, color @ k.inverse(depth))
+    scene.store.fill(i, color @ se3.inverse(depth))
     found = _aligned_all(scene, h, i, _usual_starts(scene, h, i), config)
     if found and found[0].fit < config.lost:
         three = np.array([h.poses[tracked[-2]], h.poses[b], found[0].pose])
         times_s = scene.times_s[[tracked[-2], b, i]]
-        scene.store.fill(i, k.inverse(carried_on(three, times_s, crop.depth_delay_s, scene.center_m)))
+        scene.store.fill(i, se3.inverse(carried_on(three, times_s, crop.depth_delay_s, scene.center_m)))
 
 
 def started(store: ViewStore, count: int, view: int, pose: Float[Array, "4 4"]) -> Hypothesis:
@@ -247,7 +242,7 @@ def _branches(scene: Scene, h: Hypothesis, i: int, config: BeamConfig) -> tuple[
         return [known], []
     starts = _usual_starts(scene, h, i)
     found = merged(_aligned_all(scene, h, i, starts, config) + _held(scene, h, i, starts, config), config)
-    if not found or found[0].fit > config.doubt:
+    if not found or found[0].fit > config.uncertain_cost:
         found = merged(found + _aligned_all(scene, h, i, _feature_starts(scene, h, i, config), config), config)
     if not found or found[0].fit > config.search:
         found = merged(found + _searched(scene, h, i, starts, config), config)
@@ -281,7 +276,7 @@ def _usual_starts(scene: Scene, h: Hypothesis, i: int) -> list[tuple[str, Float[
 
 
 def _feature_starts(scene: Scene, h: Hypothesis, i: int, config: BeamConfig) -> list[tuple[str, Float[Array, "4 4"]]]:
-    """Poses that feature matches to the last view and to the keyframes say."""
+    """Poses that feature matches to the last view and to the keyframes support."""
     here = scene.described(i)
     starts = []
     for j in dict.fromkeys((h.tracked[-1], *(j for j in reversed(h.keyframes[-8:]) if j != i))):
@@ -293,15 +288,15 @@ def _feature_starts(scene: Scene, h: Hypothesis, i: int, config: BeamConfig) -> 
 def _searched(
     scene: Scene, h: Hypothesis, i: int, starts: list[tuple[str, Float[Array, "4 4"]]], config: BeamConfig
 ) -> list[Candidate]:
-    """Coarse alignment from a grid of turns about the body's middle; the best few aligned finely."""
+    """Coarse alignment from a grid of rotations about the body's center of mass; the best few aligned finely."""
     base = [s for s in starts if s[0] in ("shift", "prior on cloud")]
     tries = []
     for _, pose in base:
-        middle = pose[:3, :3] @ scene.center_m + pose[:3, 3]
+        center = pose[:3, :3] @ scene.center_m + pose[:3, 3]
         for turn in turn_grid(config.grid_deg, config.grid_axes):
             turned = pose.copy()
             turned[:3, :3] = turn @ pose[:3, :3]
-            turned[:3, 3] = middle - turned[:3, :3] @ scene.center_m
+            turned[:3, 3] = center - turned[:3, :3] @ scene.center_m
             tries.append(turned)
     tried = [_aligned(scene, h, i, t, config.grid, config, "grid") for t in tries]
     rough = merged([c for c in tried if c is not None], config)[:8]
@@ -323,8 +318,7 @@ def _refined(scene: Scene, h: Hypothesis, i: int, rough: list[Candidate], config
 def _held(
     scene: Scene, h: Hypothesis, i: int, starts: list[tuple[str, Float[Array, "4 4"]]], config: BeamConfig
 ) -> list[Candidate]:
-    """The foretold motion, moved only where the images insist: what looks the same from all sides must not turn with
-    its shading."""
+    """The predicted motion, moved only where images insist: a uniform body must not turn with its shading."""
     found = []
     for name, pose in starts:
         if name == "prior":
@@ -349,11 +343,11 @@ def _carried(scene: Scene, h: Hypothesis, i: int, config: BeamConfig) -> Candida
         return None
     pose = motion @ h.poses[h.tracked[-1]]
     found = _aligned(scene, h, i, pose, config.fine, config, "carried", pose, config.still_share)
-    return found if found is not None and found.fit < config.doubt else None
+    return found if found is not None and found.fit < config.uncertain_cost else None
 
 
 def merged(candidates: list[Candidate], config: BeamConfig) -> list[Candidate]:
-    """Sorted by cost, without those that say the same as a better one."""
+    """Sorted by cost, without those that agree with a better one."""
     kept: list[Candidate] = []
     near = 1 + 2 * np.cos(np.radians(config.apart_deg))  # the trace of a turn by that angle
     for c in sorted(candidates, key=lambda c: c.cost):
@@ -366,7 +360,7 @@ def _aligned(
     scene: Scene, h: Hypothesis, i: int, pose: Float[Array, "4 4"], schedule: Schedule, config: BeamConfig, source: str,
     held: Float[Array, "4 4"] | None = None, share: float = 1.0,
 ) -> Candidate | None:  # fmt: skip
-    """One candidate aligned to the nearest views of the model, held to the pose that the motion foretells where it is
+    """One candidate aligned to the nearest views of the model, held to the pose that the motion predicts where it is
     given; None where nothing faces it."""
     refs = references(
         h.poses, tuple(j for j in h.keyframes if j != i), h.tracked[-1], pose, scene.center_m, config.keyframes
@@ -378,20 +372,20 @@ def _aligned(
     pull, wanted = (np.zeros(6), np.eye(4)) if held is None else (_hold(config) / share**2, held)
     aligned, _, fit, on, _ = k.align_view(
         np.ascontiguousarray(pose), i, refs, np.ascontiguousarray(h.poses[refs]), store.maps, store.samples,
-        store.table, store.optics.focal, store.optics.center, rows(schedule, distance), pull, wanted,
+        store.table, store.rectified.focal, store.rectified.center, rows(schedule, distance), pull, wanted,
     )  # fmt: skip
     if not np.isfinite(aligned).all():
         return None
-    return Candidate(aligned, float(fit), _price(scene, h, i, aligned, config), float(on), source)
+    return Candidate(aligned, float(fit), _motion_cost(scene, h, i, aligned, config), float(on), source)
 
 
 def _hold(config: BeamConfig) -> Float[Array, "6"]:
-    """Information of the pull towards the foretold pose (translation, rotation)."""
+    """Information of the pull towards the predicted pose (translation, rotation)."""
     turn = config.hold / np.radians(config.hold_deg) ** 2
     return np.array([config.hold / config.hold_m**2] * 3 + [turn] * 3)
 
 
-def _price(scene: Scene, h: Hypothesis, i: int, pose: Float[Array, "4 4"], config: BeamConfig) -> float:
+def _motion_cost(scene: Scene, h: Hypothesis, i: int, pose: Float[Array, "4 4"], config: BeamConfig) -> float:
     tracked = h.tracked
     times = scene.times_s
     if len(tracked) < 2:

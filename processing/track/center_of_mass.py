@@ -1,4 +1,4 @@
-"""Where the body's middle of mass is, from its free flight."""
+"""Where the body's center of mass is, from its free flight."""
 
 from __future__ import annotations
 

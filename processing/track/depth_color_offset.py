@@ -6,12 +6,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray as Array
 
-from processing.motion.motion_prior import between, turn_between
-from processing.track import kernels as k
+from processing.motion import se3_kernels as se3
+from processing.motion.impacts import LATE_DEPTH_IMPACT_M_S
+from processing.motion.interpolate import between, turn_between
 from processing.track.beam import LEAST_DELAY_S, Scene
-
-IMPACT_M_S = 0.35
-"""A change of velocity around a frame beyond this is an impact."""
 
 
 def put_at_color_times(scene: Scene, poses: Float[Array, "n 4 4"], use: Bool[Array, " n"]) -> Bool[Array, " n"]:
@@ -23,7 +21,7 @@ def put_at_color_times(scene: Scene, poses: Float[Array, "n 4 4"], use: Bool[Arr
         if crop is None or abs(crop.depth_delay_s) < LEAST_DELAY_S or len(index) < 2:
             continue
         at_depth = _at_depth_time(scene, poses, index, a, crop.depth_delay_s)
-        out[i] = scene.store.fill(int(i), poses[i] @ k.inverse(at_depth))
+        out[i] = scene.store.fill(int(i), poses[i] @ se3.inverse(at_depth))
     return out
 
 
@@ -41,11 +39,11 @@ def _at_depth_time(
     for x, y in ((before, after), side):
         centers = [poses[z][:3, :3] @ scene.center_m + poses[z][:3, 3] for z in (x, y)]
         speeds.append((centers[1] - centers[0]) / (t[y] - t[x]))
-    hit = bool(np.linalg.norm(speeds[0] - speeds[1]) > IMPACT_M_S) or before == i or after == i
+    hit = bool(np.linalg.norm(speeds[0] - speeds[1]) > LATE_DEPTH_IMPACT_M_S) or before == i or after == i
     x, y = side if hit else (before, after)
     share = delay_s / (t[y] - t[x])
-    step = between(poses[x], poses[y], abs(float(share)), scene.center_m) @ k.inverse(poses[x])  # camera axes
-    turn = step if share > 0 else k.inverse(step)
+    step = between(poses[x], poses[y], abs(float(share)), scene.center_m) @ se3.inverse(poses[x])  # camera axes
+    turn = step if share > 0 else se3.inverse(step)
     out = _carried(poses[i], turn, poses[x], poses[y], float(share), scene.center_m)
     if not hit and _falls(scene, poses, (int(before), int(i), int(after))):
         out[:3, 3] += 0.5 * scene.gravity_camera_m_s2 * delay_s**2
@@ -64,7 +62,7 @@ def unknown_motion(
             continue
         centers = [poses[z][:3, :3] @ scene.center_m + poses[z][:3, 3] for z in (before, i, after)]
         speed = (centers[2] - centers[1]) / (t[after] - t[i]) - (centers[1] - centers[0]) / (t[i] - t[before])
-        if np.linalg.norm(speed) < 2 * IMPACT_M_S:
+        if np.linalg.norm(speed) < 2 * LATE_DEPTH_IMPACT_M_S:
             continue
         spin = turn_between(poses[after], poses[i]) / (t[after] - t[i])
         spin = spin - turn_between(poses[i], poses[before]) / (t[i] - t[before])
@@ -75,7 +73,7 @@ def unknown_motion(
 
 
 def _falls(scene: Scene, poses: Float[Array, "n 4 4"], three: tuple[int, int, int]) -> bool:
-    """Whether the body's middle accelerates by most of gravity over three views."""
+    """Whether the body's center of mass accelerates by most of gravity over three views."""
     x0, x1, x2 = (poses[z][:3, :3] @ scene.center_m + poses[z][:3, 3] for z in three)
     first_s, second_s = np.diff(scene.times_s[list(three)])
     change = 2 * ((x2 - x1) / second_s - (x1 - x0) / first_s) / (first_s + second_s)
@@ -87,7 +85,7 @@ def _carried(
     pose: Float[Array, "4 4"], turn: Float[Array, "4 4"], start: Float[Array, "4 4"], end: Float[Array, "4 4"],
     share: float, center_m: Float[Array, "3"],
 ) -> Float[Array, "4 4"]:  # fmt: skip
-    """`pose` turned as `turn` turns, its middle moved by `share` of the way from `start`'s to `end`'s."""
+    """`pose` turned as `turn` turns, its center of mass moved by `share` of the way from `start`'s to `end`'s."""
     out = np.eye(4)
     out[:3, :3] = turn[:3, :3] @ pose[:3, :3]
     way = (end[:3, :3] @ center_m + end[:3, 3]) - (start[:3, :3] @ center_m + start[:3, 3])

@@ -1,4 +1,4 @@
-"""What is said of each frame: how well it fits, whether its pose may be trusted, how far it may be off."""
+"""What is reported of each frame: how well it fits, whether its pose may be trusted, how far it may be off."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray as Array
 
-from processing.motion.motion_prior import between
+from processing.motion.interpolate import between
+from processing.sensor import noise
 from processing.track.beam import Scene
 from recordings.geometry import rotation_log, skew
 from recordings.tracks import Status
@@ -26,13 +27,11 @@ class FlagConfig:
     gap_sigma_rad: float = 0.15
     gap_sigma_m: float = 0.02
     """Standard deviation of an interpolated pose in the middle of the longest gap."""
-    correlated: float = 3.0
-    """Covariances of the joint refinement times this: its residuals share more noise than it knows (shading, the depth
-    sensor's fixed pattern). From the normalised errors on simulated variety."""
+    correlated: float = noise.TRACK_COVARIANCE_SCALE
     rival_cost: float = 0.0015
-    """Another story of the same frames that fits worse by this much counts half as evidence of doubt."""
+    """Another hypothesis of the same frames that costs more by this much counts half towards the uncertainty."""
     joining_cost: float = 0.15
-    """Pairs of views that fit worse do not tell how one is turned against the other."""
+    """Pairs of views that fit worse do not fix how one is rotated against the other."""
     joining_share: float = 0.5
     """Nor do pairs that see less of each other's surface."""
     unjoined_sigma_rad: float = 0.5
@@ -51,11 +50,11 @@ def per_view(pairs: Int[Array, "m 2"], figures: Float[Array, "m 3"], n: int) -> 
     return cost, on
 
 
-def doubt(
+def uncertainty(
     poses: Float[Array, "n 4 4"], rival: Float[Array, "n 4 4"], worse_by: float, config: FlagConfig
 ) -> Float[Array, "n 6 6"]:
-    """Covariance (twist of the object frame, translation first) that another story of the same frames adds: the outer
-    product of their difference, less the worse the other one fits. Zero where either has no pose."""
+    """Covariance (twist of the object frame, translation first) that another hypothesis of the same frames adds: the
+    outer product of their difference, less the worse the other one fits. Zero where either has no pose."""
     out = np.zeros((len(poses), 6, 6))
     share = 1.0 / (1.0 + (worse_by / config.rival_cost) ** 2)
     for i in np.flatnonzero(np.isfinite(poses[:, 0, 0]) & np.isfinite(rival[:, 0, 0])):
@@ -81,10 +80,11 @@ def unjoined(
     return np.asarray(use & ~np.isin(label[: len(use)], label[list(roots)]))
 
 
-def unjoined_doubt(
+def unjoined_uncertainty(
     hanging: Bool[Array, " n"], center_m: Float[Array, "3"], config: FlagConfig
 ) -> Float[Array, "n 6 6"]:
-    """Covariance (twist of the object frame, translation first) of a turn about the body's middle, for these frames."""
+    """Covariance (twist of the object frame, translation first) of a rotation about the body's center of mass, for
+    these frames."""
     turn = np.vstack([skew(center_m), np.eye(3)])  # w about the point c moves the origin by -w x c = c x w
     return np.where(hanging[:, None, None], config.unjoined_sigma_rad**2 * turn @ turn.T, 0.0)
 

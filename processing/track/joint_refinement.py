@@ -15,12 +15,15 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray as Array
 
-from processing.motion.motion_prior import turn_between
+from processing.motion import se3_kernels as se3
+from processing.motion.interpolate import turn_between
+from processing.sensor import noise
 from processing.sensor.view import ViewStore
 from processing.track import kernels as k
 from processing.track.beam import Schedule, rows
 from processing.track.keyframes import view_directions
 from recordings.geometry import rotation_log, skew
+from recordings.robust import geman_mcclure_weight
 
 
 @dataclass(frozen=True)
@@ -44,8 +47,8 @@ class GraphConfig:
         (0, 3, 0.003, 0.15, 0.002, 1.0),
         (0, 5, 0.0035, 0.08, 0.002, 1.0),
     )
-    """The last row weighs looks more: they err by a tenth of a pixel, and whole patches of depth err together. The
-    outline, good to half a pixel, holds the turn of bodies whose looks say little."""
+    """The last row weighs appearance more: it errs by a tenth of a pixel, and whole patches of depth err together. The
+    outline, good to half a pixel, holds the rotation of bodies whose appearance varies little."""
     sure_cost: float = 0.08
     """A pair that fits worse counts less."""
     spin_change_rad_s: float = 0.5
@@ -65,20 +68,21 @@ class GraphConfig:
     """... and what moves more is not held."""
     round_body: bool = False
     """Surfaces that turn away from the camera and brightness count little: on a round body they stay with the view."""
-    shared_noise: float = 8.0
-    """A view's pairs share its noise: together they count as one, so many times over."""
+    shared_noise: float = noise.PAIRS_PER_MEASUREMENT
 
 
 def steady_motion() -> GraphConfig:
-    """Settings under which steady motion outweighs what the images say."""
+    """Settings under which steady motion outweighs what the images show."""
     rough = ((1, 6, 0.006, 0.4, 0.008, 0.3), (1, 6, 0.006, 0.4, 0.008, 0.5))
-    return GraphConfig(shared_noise=200.0, jerk_rad_s=0.1, schedule=(*rough, *GraphConfig().schedule[1:]))
+    return GraphConfig(
+        shared_noise=noise.STEADY_PAIRS_PER_MEASUREMENT, jerk_rad_s=0.1, schedule=(*rough, *GraphConfig().schedule[1:])
+    )
 
 
 def round_views() -> GraphConfig:
     """Settings for views that a round body's profile ties already: pairs of them, which drift, count little."""
     fine = ((1, 2, 0.006, 0.4, 0.008, 0.3), (0, 4, 0.003, 0.15, 0.005, 0.3), (0, 6, 0.0035, 0.08, 0.005, 0.3))
-    return GraphConfig(round_body=True, shared_noise=100.0, schedule=fine)
+    return GraphConfig(round_body=True, shared_noise=noise.ROUND_PAIRS_PER_MEASUREMENT, schedule=fine)
 
 
 @runtime_checkable
@@ -94,7 +98,7 @@ class Terms(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """What the pull towards free flight needs: times, gravity (camera axes), the body's middle (object frame),
+    """What the pull towards free flight needs: times, gravity (camera axes), the body's center of mass (object frame),
     and which views follow each other within one toss (views of other tosses have other numbers)."""
 
     times_s: Float[Array, " n"]
@@ -181,7 +185,7 @@ def refine(
             for i in np.flatnonzero(place >= 0):
                 twist = step[place[i]]
                 size = max(np.linalg.norm(twist[:3]) / 0.03, np.linalg.norm(twist[3:]) / 0.2, 1.0)
-                poses[i] = poses[i] @ k.inverse(k.exponential(twist / size))
+                poses[i] = poses[i] @ se3.inverse(se3.exponential(twist / size))
             if np.abs(step[:, :3]).max(initial=0) < 3e-5 and np.abs(step[:, 3:]).max(initial=0) < 3e-4:
                 break
     return Refined(poses, _covariances(H, place), pairs, figures)
@@ -212,7 +216,7 @@ def _normal_equations(
     blocks, gradients = np.zeros((len(pairs), 6, 6)), np.zeros((len(pairs), 6))
     figures = np.zeros((len(pairs), 3))
     k.graph_terms(
-        poses, pairs, store.maps, store.samples, store.table, store.optics.focal, store.optics.center, row,
+        poses, pairs, store.maps, store.samples, store.table, store.rectified.focal, store.rectified.center, row,
         blocks, gradients, figures,
     )  # fmt: skip
     weight = 1.0 / (1.0 + (figures[:, 0] / config.sure_cost) ** 2) / config.shared_noise
@@ -245,7 +249,7 @@ def _add_motion(
     place: Int[Array, " n"], motion: Motion, config: GraphConfig,
 ) -> None:  # fmt: skip
     """Adds the pull towards constant spin and ballistic centre over each three views in a row; impacts are outliers
-    (`_believed`). The residuals are changes of spin (rad/s) and of velocity (m/s), camera axes."""
+    (`_accepted`). The residuals are changes of spin (rad/s) and of velocity (m/s), camera axes."""
     index = np.flatnonzero(use)
     _add_ties(H, g, poses, index, place, motion, config)
     if config.jerk_rad_s is not None:
@@ -255,8 +259,8 @@ def _add_motion(
             continue
         residual, jacobians = motion_residual((poses[a], poses[b], poses[c]), motion.times_s[[a, b, c]], motion)
         spin, speed = residual[:3] / config.spin_change_rad_s, residual[3:] / config.velocity_change_m_s
-        w_spin = _believed(spin) / config.spin_change_rad_s**2
-        w_speed = _believed(speed) / config.velocity_change_m_s**2
+        w_spin = _accepted(spin) / config.spin_change_rad_s**2
+        w_speed = _accepted(speed) / config.velocity_change_m_s**2
         w = np.array([w_spin] * 3 + [w_speed] * 3)
         for x, jx in zip((a, b, c), jacobians):
             if place[x] < 0:
@@ -271,14 +275,14 @@ def _add_smooth(
     H: Float[Array, "f f 6 6"], g: Float[Array, "f 6"], poses: Float[Array, "n 4 4"], index: Int[Array, " m"],
     place: Int[Array, " n"], motion: Motion, sigma_rad_s: float,
 ) -> None:  # fmt: skip
-    """Adds the pull towards a steady change of spin over each four views in a row (rad/s, camera axes; `_believed`)."""
+    """Adds the pull towards a steady change of spin over each four views in a row (rad/s, camera axes; `_accepted`)."""
     for four in zip(index, index[1:], index[2:], index[3:]):
         if len({int(motion.toss[i]) for i in four}) > 1 or motion.still[list(four[1:])].any():
             continue
         steps = np.diff(motion.times_s[list(four)])
         spins = [turn_between(poses[b], poses[a]) / s for a, b, s in zip(four, four[1:], steps)]
         residual = spins[2] - 2 * spins[1] + spins[0]
-        w = _believed(residual / sigma_rad_s) / sigma_rad_s**2
+        w = _accepted(residual / sigma_rad_s) / sigma_rad_s**2
         shares = (-1 / steps[0], 1 / steps[0] + 2 / steps[1], -2 / steps[1] - 1 / steps[2], 1 / steps[2])
         jacobians = [-share * poses[i][:3, :3] for i, share in zip(four, shares)]
         for x, jx in zip(four, jacobians):
@@ -290,10 +294,10 @@ def _add_smooth(
                     H[place[x], place[y], 3:, 3:] += w * jx.T @ jy
 
 
-def _believed(normalised: Float[Array, " d"]) -> float:
+def _accepted(normalised: Float[Array, " d"]) -> float:
     """Weight of a change of motion in standard deviations (Geman-McClure): an impact must not pull at all. A kernel
     whose pull fades slowly (Cauchy) turns small or blurred objects by tens of degrees where they hit the table."""
-    return float(1.0 / (1.0 + normalised @ normalised / 4.0) ** 2)
+    return float(geman_mcclure_weight(normalised @ normalised / 4.0))
 
 
 def _add_ties(
@@ -320,15 +324,15 @@ def is_held(poses: Float[Array, "n 4 4"], a: int, b: int, motion: Motion, config
     """Whether the body moves from one view to the next as the robot's hand does."""
     if (a, b) not in motion.carried:
         return False
-    off = motion.carried[a, b] @ poses[a] @ k.inverse(poses[b])
-    middle = poses[b][:3, :3] @ motion.center_m + poses[b][:3, 3]
+    off = motion.carried[a, b] @ poses[a] @ se3.inverse(poses[b])
+    center = poses[b][:3, :3] @ motion.center_m + poses[b][:3, 3]
     turn = np.linalg.norm(rotation_log(off[:3, :3]))
-    return bool(turn < config.held_rad and np.linalg.norm(off[:3, :3] @ middle + off[:3, 3] - middle) < config.held_m)
+    return bool(turn < config.held_rad and np.linalg.norm(off[:3, :3] @ center + off[:3, 3] - center) < config.held_m)
 
 
 def _gap(one: Float[Array, "4 4"], two: Float[Array, "4 4"]) -> Float[Array, "6"]:
     """Twist between two poses: that of the first one's view less that of the second's, near the solution."""
-    gap = k.inverse(one) @ two
+    gap = se3.inverse(one) @ two
     return np.concatenate([gap[:3, 3], rotation_log(gap[:3, :3])])
 
 

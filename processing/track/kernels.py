@@ -1,9 +1,7 @@
-"""Compiled kernels of the tracker: smooth depth and normals of a view, and the residuals of one view against another.
+"""Compiled residuals of one view against another, and the pose of a view that makes them small.
 
-A view is a crop of the rectified (pinhole) image with CHANNELS values a pixel, stored in one flat array for all views
-of a toss, and a few hundred sampled surface points. `table` says where each view's pixels and samples lie. Poses are
-4x4 `camera_from_object`; corrections are twists (translation, rotation) of the object frame, applied on its left:
-object_from_camera <- exp(twist) object_from_camera.
+`sensor/view_layout.py` says how views lie in memory. Poses are 4x4 `camera_from_object`; corrections are twists
+(translation, rotation) of the object frame, applied on its left: object_from_camera <- exp(twist) object_from_camera.
 """
 
 from __future__ import annotations
@@ -13,122 +11,43 @@ from typing import no_type_check
 import numpy as np
 from numba import njit
 
-# long because: the kernels share the layout of views and samples that is laid down here
-
-Z, NX, NY, NZ, OUTSIDE = range(5)
-LOOKS = 3
-"""Brightness levelled against shading, and two differences of colour that shading leaves alone."""
-SHARP, SMOOTH, CHANNELS = 5, 5 + LOOKS, 5 + 2 * LOOKS
-"""First channel of the sharp looks and of the smooth ones; channels in all."""
-HIDDEN = -1.0
-"""OUTSIDE holds the distance to the mask in pixels (0 inside), or HIDDEN where something nearer may be in the way."""
-NO_LOOK = 100.0
-"""Looks of a pixel whose colour is not the object's (its depth comes from elsewhere); far beyond any real value."""
-
-OFFSET, U0, V0, WIDTH, HEIGHT, FIRST, COUNT = range(7)
-"""Columns of the view table: first pixel, crop corner and size, first sample and number of samples."""
-
-PX, PY, PZ, SNX, SNY, SNZ, SSHARP = range(7)
-SAMPLE = 6 + 2 * LOOKS
-"""Columns of a sample: point and normal in its camera's frame (m), then its looks: LOOKS sharp, LOOKS smooth."""
+from processing.motion.se3_kernels import exponential, inverse
+from processing.sensor.view_layout import (
+    APPEARANCE,
+    COUNT,
+    FIRST,
+    HEIGHT,
+    NO_APPEARANCE,
+    NX,
+    NY,
+    NZ,
+    OFFSET,
+    OUTSIDE,
+    PX,
+    PY,
+    PZ,
+    SHARP,
+    SNX,
+    SNY,
+    SNZ,
+    SSHARP,
+    U0,
+    V0,
+    WIDTH,
+    Z,
+)
 
 LEVEL, STEPS, GEOMETRY_M, INTENSITY, OUTLINE_M, SHARE, ROUND = range(7)
 """Columns of a schedule row: intensity channel (0 sharp, 1 smooth), steps, the three scales, share of the samples."""
 
 LEAST_SLOPE, LEAST_BRIGHT_SLOPE = 0.03, 0.1
-"""Looks that change by less a pixel are shading, which stays with the room: they pull little; brightness above all."""
+"""An appearance that changes by less a pixel is shading, which stays with the room: it pulls little; brightness above
+all."""
 GRAZING, FACING = 0.3, 0.8
 COVERED_COST = 0.12
 """Of a point that faces the other view but lies behind what is seen there: it may be covered."""
 ODD_COST = 0.4
 """Of a point beside a surface that faces elsewhere, or in front of a hole."""
-
-
-@no_type_check
-@njit(cache=True, nogil=True, fastmath=True)
-def fit_surface(depth_m, inside, rays, radius, edge_share, out_m, normals):  # noqa: C901 (one hot loop)
-    """Local planes, fitted to inverse depth (in which planes stay planes) over a window, twice: the second time
-    without what lies off the first plane. Fills small holes. Writes depth and normal, 0 where there is no plane."""
-    # long because: one compiled loop over pixels, its sums kept in registers
-    # long because: one hot loop over pixels whose sums live in registers
-    h, w = depth_m.shape
-    for v in range(h):
-        for u in range(w):
-            out_m[v, u] = 0.0
-            if not inside[v, u]:
-                continue
-            z0 = depth_m[v, u]
-            if z0 <= 0.0:
-                total, n = 0.0, 0
-                for dv in range(-1, 2):
-                    for du in range(-1, 2):
-                        y, x = v + dv, u + du
-                        if 0 <= y < h and 0 <= x < w and inside[y, x] and depth_m[y, x] > 0:
-                            total += depth_m[y, x]
-                            n += 1
-                if n < 3:
-                    continue
-                z0 = total / n
-            q0 = 1.0 / z0
-            a, b, c = q0, 0.0, 0.0
-            good = False
-            for again in range(2):
-                limit = edge_share * z0 * (1.5 if again == 0 else 0.5)
-                s = sx = sy = sxx = sxy = syy = sq = sqx = sqy = 0.0
-                for dv in range(-radius, radius + 1):
-                    for du in range(-radius, radius + 1):
-                        y, x = v + dv, u + du
-                        if y < 0 or x < 0 or y >= h or x >= w or not inside[y, x]:
-                            continue
-                        z = depth_m[y, x]
-                        if z <= 0.0:
-                            continue
-                        q = 1.0 / z
-                        gap = (q - (a + b * du + c * dv)) * z * z0
-                        if abs(gap) > limit:
-                            continue
-                        k = 1.0 - (abs(gap) / limit) ** 2
-                        s += k
-                        sx += k * du
-                        sy += k * dv
-                        sxx += k * du * du
-                        sxy += k * du * dv
-                        syy += k * dv * dv
-                        e = q - q0
-                        sq += k * e
-                        sqx += k * e * du
-                        sqy += k * e * dv
-                if s < 6.0:
-                    good = False
-                    break
-                mx, my, mq = sx / s, sy / s, sq / s
-                cxx, cxy, cyy = sxx / s - mx * mx, sxy / s - mx * my, syy / s - my * my
-                cqx, cqy = sqx / s - mq * mx, sqy / s - mq * my
-                det = cxx * cyy - cxy * cxy
-                if det < 0.05:
-                    good = False
-                    break
-                b = (cqx * cyy - cqy * cxy) / det
-                c = (cqy * cxx - cqx * cxy) / det
-                a = q0 + mq - b * mx - c * my
-                good = True
-            if not good or a <= 0.0:
-                continue
-            # 1/z = n . ray / d: the plane's normal follows from the slopes of 1/z per ray coordinate
-            dx = rays[0]
-            dy = rays[1]
-            x = rays[2] + u * dx
-            y = rays[3] + v * dy
-            n0, n1 = b / dx, c / dy
-            n2 = a - n0 * x - n1 * y
-            length = np.sqrt(n0 * n0 + n1 * n1 + n2 * n2)
-            cosine = a / (length * np.sqrt(x * x + y * y + 1.0))
-            if cosine < 0.12:  # grazing: flying pixels, not a surface
-                continue
-            out_m[v, u] = 1.0 / a
-            normals[v, u, 0] = -n0 / length
-            normals[v, u, 1] = -n1 / length
-            normals[v, u, 2] = -n2 / length
 
 
 @no_type_check
@@ -237,18 +156,18 @@ def pair_terms(samples, step, pose, maps, row, focal, center, level, s_geo, s_in
             ju, jv = int(np.floor(u)), int(np.floor(v))
             a, b = u - ju, v - jv
             q = off + jv * w + ju
-            ch = SHARP + level * LOOKS
+            ch = SHARP + level * APPEARANCE
             foreign = max(max(maps[q, ch], maps[q + 1, ch]), max(maps[q + w, ch], maps[q + w + 1, ch]))
-            if max(foreign, p[SSHARP]) > 0.5 * NO_LOOK:
+            if max(foreign, p[SSHARP]) > 0.5 * NO_APPEARANCE:
                 cost += 0.5 * COVERED_COST
                 continue
-            for c in range(LOOKS):
-                ch = SHARP + level * LOOKS + c
+            for c in range(APPEARANCE):
+                ch = SHARP + level * APPEARANCE + c
                 i00, i10, i01, i11 = maps[q, ch], maps[q + 1, ch], maps[q + w, ch], maps[q + w + 1, ch]
                 top, bottom = i00 * (1 - a) + i10 * a, i01 * (1 - a) + i11 * a
-                e = top * (1 - b) + bottom * b - p[SSHARP + level * LOOKS + c]
+                e = top * (1 - b) + bottom * b - p[SSHARP + level * APPEARANCE + c]
                 r = e / s_int
-                cost += 0.5 / LOOKS * min(r * r / 9.0, 1.0)
+                cost += 0.5 / APPEARANCE * min(r * r / 9.0, 1.0)
                 if abs(r) < 3.0:
                     gu = (i10 - i00) * (1 - b) + (i11 - i01) * b
                     gv = bottom - top
@@ -301,32 +220,6 @@ def to_object(H, g, pose, sign, H_out, g_out):
             full[b, a] = H[a, b]
     H_out += A.T @ full @ A
     g_out += sign * (A.T @ g)
-
-
-@no_type_check
-@njit(cache=True, nogil=True)
-def inverse(pose):
-    out = np.eye(4)
-    back = np.ascontiguousarray(pose[:3, :3].T)
-    out[:3, :3] = back
-    out[:3, 3] = -(back @ np.ascontiguousarray(pose[:3, 3]))
-    return out
-
-
-@no_type_check
-@njit(cache=True, nogil=True)
-def exponential(twist):
-    """4x4 of a twist (translation, rotation): the translation is taken as it is."""
-    out = np.eye(4)
-    angle = np.sqrt(twist[3] ** 2 + twist[4] ** 2 + twist[5] ** 2)
-    s = 1.0 - angle * angle / 6.0 if angle < 1e-4 else np.sin(angle) / angle
-    c = 0.5 - angle * angle / 24.0 if angle < 1e-4 else (1.0 - np.cos(angle)) / (angle * angle)
-    K = np.zeros((3, 3))
-    K[0, 1], K[0, 2], K[1, 2] = -twist[5], twist[4], -twist[3]
-    K[1, 0], K[2, 0], K[2, 1] = twist[5], -twist[4], twist[3]
-    out[:3, :3] += s * K + c * (K @ K)
-    out[:3, 3] = twist[:3]
-    return out
 
 
 @no_type_check

@@ -1,4 +1,4 @@
-"""The memory pool: which views serve as the model, and which of them a new view is compared with."""
+"""The keyframes: which views serve as the model, and which of them a new view is compared with."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from numpy import ndarray as Array
 
 @dataclass(frozen=True)
 class KeyframeConfig:
-    """When a view joins the pool and how many of the pool are used at once."""
+    """When a view becomes a keyframe and how many keyframes are used at once."""
 
     apart_deg: float = 8.0
-    """A view joins when no keyframe is within this turn of it."""
+    """A view becomes one when no keyframe is within this rotation of it."""
     nearer: float = 0.85
     """... or when it is this much nearer than the keyframes around."""
     used: int = 4
@@ -24,13 +24,13 @@ class KeyframeConfig:
 
 
 def view_directions(poses: Float[Array, "n 4 4"], center_m: Float[Array, "3"]) -> Float[Array, "n 3"]:
-    """Unit vectors from the body's middle to the camera, object frame."""
-    middle = poses[:, :3, :3] @ center_m + poses[:, :3, 3]
-    direction = -np.einsum("nji,nj->ni", poses[:, :3, :3], middle)
+    """Unit vectors from the body's center of mass to the camera, object frame."""
+    center = poses[:, :3, :3] @ center_m + poses[:, :3, 3]
+    direction = -np.einsum("nji,nj->ni", poses[:, :3, :3], center)
     return np.asarray(direction / np.linalg.norm(direction, axis=1, keepdims=True))
 
 
-def turns_deg(poses: Float[Array, "n 4 4"], pose: Float[Array, "4 4"]) -> Float[Array, " n"]:
+def rotations_deg(poses: Float[Array, "n 4 4"], pose: Float[Array, "4 4"]) -> Float[Array, " n"]:
     """Rotation angle between each pose and one, degrees."""
     cosine = (np.einsum("nij,ij->n", poses[:, :3, :3], pose[:3, :3]) - 1) / 2
     return np.asarray(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
@@ -43,9 +43,9 @@ def is_new(
     center_m: Float[Array, "3"],
     config: KeyframeConfig,
 ) -> bool:
-    """Whether `view` shows what no keyframe shows: another turn, or the same from much nearer."""
+    """Whether `view` shows what no keyframe shows: another side, or the same from much nearer."""
     keys = np.array(keyframes)
-    near = turns_deg(poses[keys], poses[view]) < config.apart_deg
+    near = rotations_deg(poses[keys], poses[view]) < config.apart_deg
     if not near.any():
         return True
     depth = poses[keys][near][:, :3, 3][:, 2].min()
@@ -61,13 +61,13 @@ def references(
     config: KeyframeConfig,
 ) -> Int[Array, " m"]:
     """Views to compare a view at `pose` with: the last one and the keyframes that look from the nearest directions."""
-    pool = np.array(sorted({*keyframes, last}))
-    directions = view_directions(poses[pool], center_m)
+    views = np.array(sorted({*keyframes, last}))
+    directions = view_directions(poses[views], center_m)
     here = view_directions(pose[None], center_m)[0]
     angle = np.degrees(np.arccos(np.clip(directions @ here, -1, 1)))
-    order = np.argsort(angle + 0.05 * turns_deg(poses[pool], pose))
+    order = np.argsort(angle + 0.05 * rotations_deg(poses[views], pose))
     order = order[angle[order] < config.co_visible_deg][: config.used]
-    chosen = pool[order]
-    if last not in chosen and angle[pool == last][0] < config.co_visible_deg:
+    chosen = views[order]
+    if last not in chosen and angle[views == last][0] < config.co_visible_deg:
         chosen = np.concatenate([chosen[: config.used - 1], [last]])
     return np.asarray(chosen, dtype=np.int64)

@@ -14,8 +14,9 @@ from jaxtyping import Float, Int
 from numpy import ndarray as Array
 
 from processing.features.sift import relative_motions
-from processing.motion.motion_prior import all_turns
-from processing.sensor.rectification import Optics
+from processing.motion.rotation_grid import all_turns
+from processing.sensor import view_layout as lay
+from processing.sensor.rectification import Rectification
 from processing.sensor.view import Crop
 from processing.track import kernels as k
 from processing.track.beam import BeamConfig, Candidate, Scene, Schedule, merged, rows
@@ -49,12 +50,14 @@ class ShapeViews:
     poses: Float[Array, "m 4 4"]
 
 
-def middle_of(shape: ObjectShape) -> Float[Array, "3"]:
-    """Middle of the shape's box, object frame."""
+def center_of(shape: ObjectShape) -> Float[Array, "3"]:
+    """Center of the shape's box, object frame."""
     return np.asarray(0.5 * (shape.vertices_m.min(0) + shape.vertices_m.max(0)))
 
 
-def shape_views(shape: ObjectShape, crops: list[Crop | None], optics: Optics, config: ShapeConfig) -> ShapeViews:
+def shape_views(
+    shape: ObjectShape, crops: list[Crop | None], rectified: Rectification, config: ShapeConfig
+) -> ShapeViews:
     """The shape drawn from all sides at the distance that the frames' crops show the object at."""
     if len(shape.faces) == 0:
         raise BadInput("the given shape has no faces; wanted a triangle mesh")
@@ -63,13 +66,13 @@ def shape_views(shape: ObjectShape, crops: list[Crop | None], optics: Optics, co
     ]
     size_m = float(np.linalg.norm(np.ptp(shape.vertices_m, axis=0)))
     distance_m = max(float(np.median(seen)) if seen else 0.8, 1.2 * size_m)
-    poses = _around(middle_of(shape), distance_m, config.directions)
-    draw = _Painter(shape, optics)
+    poses = _around(center_of(shape), distance_m, config.directions)
+    draw = _Painter(shape, rectified)
     return ShapeViews(tuple(draw.crop(pose, len(crops) + i) for i, pose in enumerate(poses)), poses)
 
 
-def _around(middle_m: Float[Array, "3"], distance_m: float, count: int) -> Float[Array, "m 4 4"]:
-    """Poses that show the object from `count` directions, its middle on the optical axis."""
+def _around(center_m: Float[Array, "3"], distance_m: float, count: int) -> Float[Array, "m 4 4"]:
+    """Poses that show the object from `count` directions, its center on the optical axis."""
     n = np.arange(count) + 0.5
     z, phi = 1 - 2 * n / count, np.pi * (1 + 5**0.5) * n
     r = np.sqrt(1 - z * z)
@@ -78,25 +81,25 @@ def _around(middle_m: Float[Array, "3"], distance_m: float, count: int) -> Float
         right = np.cross(direction, [0.0, 0.0, 1.0] if abs(direction[2]) < 0.9 else [1.0, 0.0, 0.0])
         right /= np.linalg.norm(right)
         pose[:3, :3] = np.stack([right, np.cross(-direction, right), -direction])
-        pose[:3, 3] = np.array([0.0, 0.0, distance_m]) - pose[:3, :3] @ middle_m
+        pose[:3, 3] = np.array([0.0, 0.0, distance_m]) - pose[:3, :3] @ center_m
     return poses
 
 
 class _Painter:
     """Draws a shape's depth and colours as the ideal pinhole sees them, by one ray a pixel."""
 
-    def __init__(self, shape: ObjectShape, optics: Optics) -> None:
+    def __init__(self, shape: ObjectShape, rectified: Rectification) -> None:
         import open3d as o3d
 
-        self._shape, self._optics, self._core = shape, optics, o3d.core
+        self._shape, self._rectified, self._core = shape, rectified, o3d.core
         self._scene = o3d.t.geometry.RaycastingScene()
         vertices, faces = shape.vertices_m.astype(np.float32), shape.faces.astype(np.uint32)
         self._scene.add_triangles(o3d.core.Tensor(vertices), o3d.core.Tensor(faces))
 
     def crop(self, pose: Float[Array, "4 4"], position: int, margin_px: int = 14) -> Crop:
-        c = self._optics.camera
+        c = self._rectified.camera
         points = self._shape.vertices_m @ pose[:3, :3].T + pose[:3, 3]
-        pixels = points[:, :2] / points[:, 2:] * self._optics.focal + self._optics.center
+        pixels = points[:, :2] / points[:, 2:] * self._rectified.focal + self._rectified.center
         low = np.floor(pixels.min(0)).astype(int) - margin_px
         high = np.ceil(pixels.max(0)).astype(int) + margin_px + 1
         u, v = np.meshgrid(np.arange(low[0], high[0]), np.arange(low[1], high[1]))
@@ -146,9 +149,9 @@ def located(scene: Scene, view: int, model: ShapeViews, beam: BeamConfig, config
 
 
 def _grid(scene: Scene, view: int, config: ShapeConfig) -> list[Float[Array, "4 4"]]:
-    """All orientations, the shape's middle somewhat behind what is seen."""
+    """All orientations, the shape's center somewhat behind what is seen."""
     row = scene.store.table[view]
-    points = scene.store.samples[row[k.FIRST] : row[k.FIRST] + row[k.COUNT], :3].astype(np.float64)
+    points = scene.store.samples[row[lay.FIRST] : row[lay.FIRST] + row[lay.COUNT], :3].astype(np.float64)
     seen = points.mean(0)
     behind = seen * (1 + 0.3 * float(np.ptp(points[:, :2], axis=0).mean()) / float(np.linalg.norm(seen)))
     out = []
@@ -180,7 +183,7 @@ def _fitted(
     distance = float(np.linalg.norm(store.center_m[view]))
     aligned, _, fit, on, _ = k.align_view(
         np.ascontiguousarray(pose), view, refs, np.ascontiguousarray(poses[refs]), store.maps, store.samples,
-        store.table, store.optics.focal, store.optics.center, rows(schedule, distance), np.zeros(6), np.eye(4),
+        store.table, store.rectified.focal, store.rectified.center, rows(schedule, distance), np.zeros(6), np.eye(4),
     )  # fmt: skip
     good = bool(np.isfinite(aligned).all())
     return Candidate(aligned if good else pose, float(fit) if good else 1.0, 0.0, float(on), "located")

@@ -1,4 +1,4 @@
-"""What a person wants to see of a track that looks wrong: rejected poses, and feature matches with the final poses."""
+"""What a person wants to see of a track that seems wrong: rejected poses, and feature matches with the final poses."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 from numpy import ndarray as Array
 
 from processing.features.sift import FeatureMatcher, Features
-from processing.track import kernels as k
+from processing.motion import se3_kernels as se3
 from processing.track.track_toss import TossTrack
 from recordings.results.track_notes import Matches, Rejected
 
@@ -88,7 +88,7 @@ def _gap_m(
     poses: Float[Array, "n 4 4"], frames: Int[Array, "m 2"], points_m: Float[Array, "m 2 3"]
 ) -> Float[Array, " m"]:
     """Distance between matched points in the object frame."""
-    to_object = {int(i): k.inverse(poses[i]) for i in np.unique(frames)}
+    to_object = {int(i): se3.inverse(poses[i]) for i in np.unique(frames)}
     placed = np.zeros_like(points_m)
     for side in (0, 1):
         turn = np.array([to_object[int(i)] for i in frames[:, side]]).reshape(-1, 4, 4)

@@ -14,16 +14,16 @@ from numpy import ndarray as Array
 
 from processing.features.sift import FeatureMatcher, Sift
 from processing.motion.motion_prior import gravity_in_camera
-from processing.sensor.photometric_gain import Exposure
-from processing.sensor.rectification import Optics
+from processing.sensor import view_layout as lay
+from processing.sensor.photometric_gain import PhotometricGain
+from processing.sensor.rectification import Rectification
 from processing.sensor.view import Crop, ViewConfig, ViewStore, cut
-from processing.track import kernels as k
 from processing.track.beam import BeamConfig, Candidate, Hypothesis, Scene, follow, started
 from processing.track.depth_color_offset import unknown_motion
-from processing.track.flags import FlagConfig, doubt, flagged, per_view, unjoined, unjoined_doubt
-from processing.track.hypotheses import Story, StoryConfig, apart_deg, settled
+from processing.track.flags import FlagConfig, flagged, per_view, uncertainty, unjoined, unjoined_uncertainty
+from processing.track.hypotheses import HypothesisConfig, TrajectoryHypothesis, apart_deg, select
 from processing.track.keyframes import is_new
-from processing.track.known_shape import ShapeConfig, ShapeViews, located, middle_of, shape_views
+from processing.track.known_shape import ShapeConfig, ShapeViews, center_of, located, shape_views
 from recordings.errors import BadInput
 from recordings.geometry import CameraModel, Transform
 from recordings.progress import Progress, Silent
@@ -40,11 +40,11 @@ class TrackConfig:
 
     view: ViewConfig = field(default_factory=ViewConfig)
     beam: BeamConfig = field(default_factory=BeamConfig)
-    story: StoryConfig = field(default_factory=StoryConfig)
+    hypotheses: HypothesisConfig = field(default_factory=HypothesisConfig)
     flags: FlagConfig = field(default_factory=FlagConfig)
     shape: ShapeConfig = field(default_factory=ShapeConfig)
-    unheard_deg: float = 20.0
-    """What is told forward is a story of its own where those told backward differ from it by more."""
+    separate_deg: float = 20.0
+    """What is estimated forward is a hypothesis of its own where those estimated backward differ from it by more."""
     least_confidence: float = 0.2
     """Frames whose mask is less sure are not looked at."""
 
@@ -56,7 +56,7 @@ class TossTrack:
     `cost` (n): how badly each frame fits the frames that see the same surface, 0 perfect .. 1 (NaN: not tracked);
     `on_surface` (n): share of its points on their surface; `keyframes`: positions of the views that span the object;
     `pairs` (m, 2) compared in the joint refinement; `rejected`: candidates (camera_from_object 4x4) per position;
-    `center_m`: estimated middle of mass in the object frame; `store`: the views, for registration between tosses.
+    `center_m`: estimated center of mass in the object frame; `store`: the views, for registration between tosses.
     """
 
     track: ObjectTrack
@@ -67,12 +67,13 @@ class TossTrack:
     rejected: dict[int, list[Candidate]]
     center_m: Float[Array, "3"]
     margin: float
-    """How much worse the best different story fits (infinite: there is none)."""
+    """How much more the best different hypothesis costs (infinite: there is none)."""
     store: ViewStore
     held: Int[Array, " n"]
     """Frames with the same number are a run through which a robot's hand carries the body; -1: none does."""
     round_body: bool = False
-    """Whether the body is round and its turn was found from all frames at once: pairs of views alone would spoil it."""
+    """Whether the body is round and its azimuth was found from all frames at once: pairs of views alone would spoil
+    it."""
 
     @property
     def tied(self) -> Int[Array, " n"]:
@@ -123,10 +124,10 @@ def track_toss(
     """Poses `camera_from_object` of all colour frames of one toss, without a model of the object unless one is given.
 
     masks: the object's visible pixels in each colour frame; confidence: how sure each is (0..1); colorless: pixels of
-    the masks that show something else's colour (an occluder before depth that was drawn). world_from_camera tells
+    the masks that show something else's colour (an occluder before depth that was drawn). world_from_camera gives
     gravity and the table (z = 0); hand: camera_from_hand of a robot that may hold the object (NaN where it does not).
 
-    The object frame is parallel to the camera at the first usable frame, its origin at the middle of the cloud seen
+    The object frame is parallel to the camera at the first usable frame, its origin at the center of the cloud seen
     there; or `start` gives camera_from_object of frame `start_frame` (None: the first usable one), which is kept.
     `poses` (NaN where unknown) are refined, only unknown frames are sought. With `model` the object frame is the
     model's: the object is located anew in the first frame (or starts from `start` or `poses`), then tracked against
@@ -143,17 +144,17 @@ def track_toss(
     known = _known(start, start_frame, poses, drawn, len(frames))
     first = _first(store, known, len(frames), toss, config)
     world = None if world_from_camera is None else world_from_camera.matrix
-    middle = _middle(store, first, known) if model is None else middle_of(model)
-    scene = Scene(store, times_s, gravity_in_camera(world), middle, matcher or Sift(), hand=hand)
+    center_m = _first_center_m(store, first, known) if model is None else center_of(model)
+    scene = Scene(store, times_s, gravity_in_camera(world), center_m, matcher or Sift(), hand=hand)
     if known.poses is None:
-        stories, margin, rejected = _followed(scene, first, known, config, progress)
+        hypotheses, margin, rejected = _followed(scene, first, known, config, progress)
     else:
-        story, margin, rejected = _filled_in(scene, known, config, progress)
-        stories = [story]
+        hypothesis, margin, rejected = _filled_in(scene, known, config, progress)
+        hypotheses = [hypothesis]
     keep_first = model is None or known.start is not None
-    joint = settled(scene, stories, first, keep_first, config.story)
+    joint = select(scene, hypotheses, first, keep_first, config.hypotheses)
     frame = object_frame if model is None else model.object_frame
-    return _told(scene, joint, first, margin, rejected, config, toss, camera.frame, frame, frames)
+    return _as_track(scene, joint, first, margin, rejected, config, toss, camera.frame, frame, frames)
 
 
 def _known(
@@ -203,87 +204,89 @@ def views_of(
         raise BadInput("a toss without frames; wanted at least one colour and depth frame")
     if colorless is not None and len(colorless) != len(frames):
         raise BadInput(f"{len(frames)} frames and {len(colorless)} masks of colourless pixels; wanted one per frame")
-    optics, exposure = Optics.of(camera), Exposure()
+    rectified, brightness = Rectification.of(camera), PhotometricGain()
     camera_from_world = None if world_from_camera is None else world_from_camera.inverse().matrix
     crops: list[Crop | None] = []
     times_ns = []
     for i, frame in enumerate(frames):
         mask = np.asarray(masks[i], dtype=bool)
-        gain = exposure.gain(frame.color_rgb, mask)
+        gain = brightness.gain(frame.color_rgb, mask)
         foreign = None if colorless is None or not colorless[i].any() else np.asarray(colorless[i], dtype=bool)
         seen = sure[i] >= config.least_confidence
-        crops.append(cut(frame, mask, i, optics, gain, config.view, camera_from_world, foreign) if seen else None)
+        crops.append(cut(frame, mask, i, rectified, gain, config.view, camera_from_world, foreign) if seen else None)
         times_ns.append(frame.time_ns)
         progress.step(i + 1, 3 * len(frames), "views")
-    drawn = None if model is None else shape_views(model, crops, optics, config.shape)
-    store = ViewStore(optics, [*crops, *(drawn.crops if drawn else ())], config.view)
+    drawn = None if model is None else shape_views(model, crops, rectified, config.shape)
+    store = ViewStore(rectified, [*crops, *(drawn.crops if drawn else ())], config.view)
     for i in range(len(store)):
         store.fill(i)
     return store, (np.array(times_ns) - times_ns[0]) * 1e-9, drawn
 
 
 def first_pose(store: ViewStore, view: int) -> Float[Array, "4 4"]:
-    """Parallel to the camera, at the middle of the cloud."""
-    first, count = int(store.table[view, k.FIRST]), int(store.table[view, k.COUNT])
+    """Parallel to the camera, at the center of the cloud."""
+    first, count = int(store.table[view, lay.FIRST]), int(store.table[view, lay.COUNT])
     pose = np.eye(4)
     pose[:3, 3] = store.samples[first : first + count, :3].mean(0)
     return pose
 
 
-def _middle(store: ViewStore, view: int, known: _Known) -> Float[Array, "3"]:
-    """Where the body's middle lies in the object frame: behind the cloud's middle by a third of its width."""
-    first, count = int(store.table[view, k.FIRST]), int(store.table[view, k.COUNT])
+def _first_center_m(store: ViewStore, view: int, known: _Known) -> Float[Array, "3"]:
+    """A first guess of the center of mass in the object frame: behind the cloud's center by a third of its width."""
+    first, count = int(store.table[view, lay.FIRST]), int(store.table[view, lay.COUNT])
     points = store.samples[first : first + count, :3].astype(np.float64)
-    middle = points.mean(0)
+    center_m = points.mean(0)
     width = float(np.ptp(points[:, :2], axis=0).mean())
-    behind = np.asarray(middle / np.linalg.norm(middle) * width * 0.3)
+    behind = np.asarray(center_m / np.linalg.norm(center_m) * width * 0.3)
     pose = known.start if known.poses is None else known.poses[view]
     if pose is None:
         return behind
-    return np.asarray(pose[:3, :3].T @ (middle + behind - pose[:3, 3]))
+    return np.asarray(pose[:3, :3].T @ (center_m + behind - pose[:3, 3]))
 
 
 def _followed(
     scene: Scene, first: int, known: _Known, config: TrackConfig, progress: Progress
 ) -> tuple[list[Hypothesis], float, dict[int, list[Candidate]]]:
-    """Stories of the same frames: the beam forward, then once more backward with all that forward learned as the
+    """Hypotheses of the same frames: the beam forward, then once more backward with all that forward learned as the
     model; a beam backward that knows nothing of the first but where the last frame is; and the beam forward itself,
-    where both backward say something else."""
+    where both backward ones differ from it."""
     n = len(scene.times_s)
 
-    def told(i: int, beam: list[Hypothesis]) -> None:
+    def report(i: int, beam: list[Hypothesis]) -> None:
         progress.step(n + i, 3 * n, "forward")
 
     beam, wide = _starts(scene, first, known, config)
-    ahead = follow(scene, np.arange(first + 1, n), beam, wide, told)
+    ahead = follow(scene, np.arange(first + 1, n), beam, wide, report)
     best = ahead.best
     last = best.tracked[-1]
-    told_all = replace(best, done=(last,), total=0.0)
+    all_done = replace(best, done=(last,), total=0.0)
     stop = first if known.model is None or known.start is not None else first - 1
     narrow = replace(config.beam, width=2)
-    stories = [follow(scene, np.arange(last - 1, stop, -1), [told_all], narrow).best]
+    hypotheses = [follow(scene, np.arange(last - 1, stop, -1), [all_done], narrow).best]
     if known.model is None and last > first + 1:
         fresh = started(scene.store, n, last, best.poses[last])
-        stories.append(_anchored(follow(scene, np.arange(last - 1, first - 1, -1), [fresh], narrow).best, best, first))
-        if all(apart_deg(best.poses[:n], s.poses[:n]) > config.unheard_deg for s in stories):
-            stories.append(best)
+        hypotheses.append(
+            _anchored(follow(scene, np.arange(last - 1, first - 1, -1), [fresh], narrow).best, best, first)
+        )
+        if all(apart_deg(best.poses[:n], s.poses[:n]) > config.separate_deg for s in hypotheses):
+            hypotheses.append(best)
     out = []
-    for story in stories:
+    for hypothesis in hypotheses:
         if any(scene.store.usable(i) for i in range(first)):
-            done = (*(i for i in story.done if i != first), first)
-            story = follow(scene, np.arange(first - 1, -1, -1), [replace(story, done=done)], narrow).best
-        out.append(replace(story, done=tuple(range(n)), total=best.total))
+            done = (*(i for i in hypothesis.done if i != first), first)
+            hypothesis = follow(scene, np.arange(first - 1, -1, -1), [replace(hypothesis, done=done)], narrow).best
+        out.append(replace(hypothesis, done=tuple(range(n)), total=best.total))
     return out, ahead.margin, ahead.rejected
 
 
-def _anchored(story: Hypothesis, other: Hypothesis, first: int) -> Hypothesis:
-    """The story in the object frame in which the first frame's pose is that of the other story."""
-    if not np.isfinite(story.poses[first, 0, 0]):
-        return story
-    own_from_other = np.linalg.inv(story.poses[first]) @ other.poses[first]
-    poses = story.poses @ own_from_other
+def _anchored(hypothesis: Hypothesis, other: Hypothesis, first: int) -> Hypothesis:
+    """The hypothesis in the object frame in which the first frame's pose is that of the other one."""
+    if not np.isfinite(hypothesis.poses[first, 0, 0]):
+        return hypothesis
+    own_from_other = np.linalg.inv(hypothesis.poses[first]) @ other.poses[first]
+    poses = hypothesis.poses @ own_from_other
     poses[first] = other.poses[first]
-    return replace(story, poses=poses)
+    return replace(hypothesis, poses=poses)
 
 
 def _starts(scene: Scene, first: int, known: _Known, config: TrackConfig) -> tuple[list[Hypothesis], BeamConfig]:
@@ -338,33 +341,34 @@ def _filled_in(
     return replace(h, done=tuple(range(n))), np.inf, rejected
 
 
-def _told(
-    scene: Scene, stories: list[Story], first: int, margin: float, rejected: dict[int, list[Candidate]],
-    config: TrackConfig, toss: int, camera: str, object_frame: str, frames: Sequence[RgbdFrame],
+def _as_track(
+    scene: Scene, hypotheses: list[TrajectoryHypothesis], first: int, margin: float,
+    rejected: dict[int, list[Candidate]], config: TrackConfig, toss: int, camera: str, object_frame: str,
+    frames: Sequence[RgbdFrame],
 ) -> TossTrack:  # fmt: skip
-    """The best story with honest flags."""
-    n, best = len(scene.times_s), stories[0]
+    """The best hypothesis with honest flags."""
+    n, best = len(scene.times_s), hypotheses[0]
     joint = best.joint
     cost, on = (figure[:n] for figure in per_view(joint.pairs, joint.figures, len(scene.store)))
     lost = ~best.use | (cost > config.flags.tracked_cost)
     lost[first] &= not best.fixed[first]
     twists = config.flags.correlated * joint.covariance[:n]
-    if best.turned is not None:
-        twist = best.turned.axis.twist
-        twists = twists + best.turned.sigma_rad[:, None, None] ** 2 * np.outer(twist, twist)
-    for other in stories[1:]:
+    if best.azimuths is not None:
+        twist = best.azimuths.axis.twist
+        twists = twists + best.azimuths.sigma_rad[:, None, None] ** 2 * np.outer(twist, twist)
+    for other in hypotheses[1:]:
         apart = other.total - best.total
-        twists = twists + doubt(joint.poses[:n], other.joint.poses[:n], apart, config.flags)
+        twists = twists + uncertainty(joint.poses[:n], other.joint.poses[:n], apart, config.flags)
     twists = twists + unknown_motion(scene, joint.poses[:n], best.use)
     hanging = unjoined(joint.pairs, joint.figures, (first, *range(n, len(scene.store))), best.use & ~lost, config.flags)
-    twists = twists + unjoined_doubt(hanging, best.center_m, config.flags)
+    twists = twists + unjoined_uncertainty(hanging, best.center_m, config.flags)
     poses, status, covariance = flagged(joint.poses[:n], twists, lost, scene, config.flags)
     times_ns = np.array([f.time_ns for f in frames], dtype=np.int64)
     track = ObjectTrack(toss, camera, object_frame, times_ns, poses, status, covariance)
-    keyframes = tuple(i for i in sorted(best.told.keyframes) if i < n and not lost[i])
+    keyframes = tuple(i for i in sorted(best.estimated.keyframes) if i < n and not lost[i])
     pairs = joint.pairs[(joint.pairs < n).all(1)]
-    for other in stories[1:]:
-        if apart_deg(joint.poses[:n], other.joint.poses[:n]) > config.story.agreeing_deg:
+    for other in hypotheses[1:]:
+        if apart_deg(joint.poses[:n], other.joint.poses[:n]) > config.hypotheses.agreeing_deg:
             margin = min(margin, other.total - best.total)
     return TossTrack(track, cost, on, keyframes, pairs, rejected, best.center_m, margin, scene.store,
                      best.held, best.axis is not None)  # fmt: skip

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Int64
 from numpy import ndarray as Array
 
-from recordings.documents import parse_json
+from recordings.bounded.documents import parse_json
 from recordings.errors import BadInput
 from recordings.session_writer import SessionWriter
 from recordings.tracks import RigCalibration

@@ -15,11 +15,12 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray as Array
 
+from recordings.constants import GRAVITY_M_S2
 from recordings.errors import BadInput
 from recordings.geometry import Transform
 from recordings.importers import common
 from recordings.importers.common import ImportReport, Warnings
-from recordings.importers.contactnets_checks import GRAVITY_M_S2, Checks, States, check_all, duplicates
+from recordings.importers.contactnets_checks import Checks, States, check_all, duplicates
 from recordings.importers.torch_file import read_tensor
 from recordings.progress import Progress, Silent
 from recordings.records import StampedPose

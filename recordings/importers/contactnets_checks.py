@@ -9,10 +9,10 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray as Array
 
+from recordings.constants import GRAVITY_M_S2
 from recordings.errors import BadInput
 from recordings.importers.common import Warnings
 
-GRAVITY_M_S2 = 9.81
 SAME_Z_M = 1e-9
 """Tosses whose heights agree to this are one recording (turning it about z leaves the heights)."""
 STEP_WARNED, STEP_REFUSED = 0.005, 0.05

@@ -12,10 +12,10 @@ import numpy as np
 from jaxtyping import Bool, UInt16
 from numpy import ndarray as Array
 
+from recordings.bounded.limits import jpeg_frame
 from recordings.errors import BadInput
 from recordings.geometry import CameraModel
 from recordings.importers.common import read_bytes
-from recordings.limits import jpeg_frame
 from recordings.mcap.codec import decode_mask, decode_pixels
 from recordings.records import EncodedImage
 

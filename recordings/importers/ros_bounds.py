@@ -17,10 +17,10 @@ from rosbags.rosbag1 import reader as rosbag1_reader
 from rosbags.rosbag2 import reader as rosbag2_reader
 from rosbags.rosbag2 import storage_mcap, storage_sqlite3
 
+from recordings.bounded.limits import MOST_CHUNK_BYTES, Budget, unpack, unpack_some
+from recordings.bounded.yaml_file import parse_yaml
 from recordings.errors import BadInput
-from recordings.limits import MOST_CHUNK_BYTES, Budget, unpack, unpack_some
 from recordings.mcap.scan import Bytes, chunk_records, parse_chunk, record_at
-from recordings.yaml_file import parse_yaml
 
 SUSPICIOUS_TIMES = 50
 """A chunk that unpacks to more than this many times its size is counted through before it is given to `rosbags`."""

@@ -21,9 +21,9 @@ from typing import Any
 import numpy as np
 from numpy import ndarray as Array
 
+from recordings.bounded.limits import MOST_TENSOR_STEPS
 from recordings.errors import BadInput
 from recordings.importers.common import read_bytes
-from recordings.limits import MOST_TENSOR_STEPS
 
 STORAGES = {
     "DoubleStorage": "<f8",

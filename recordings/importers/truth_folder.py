@@ -11,9 +11,9 @@ import numpy as np
 from jaxtyping import Float, Int64
 from numpy import ndarray as Array
 
+from recordings.bounded.limits import open_npz
 from recordings.errors import BadInput, WriteFailed
 from recordings.importers.common import Warnings, read_bytes, read_json_object
-from recordings.limits import open_npz
 from recordings.records import StampedPose
 from recordings.session_writer import toss_name, write_truth
 

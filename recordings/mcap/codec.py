@@ -23,7 +23,7 @@ from google.protobuf.message import DecodeError
 from jaxtyping import Float, UInt8
 from numpy import ndarray as Array
 
-from recordings import limits
+from recordings.bounded import limits
 from recordings.errors import BadInput, DamagedFile
 from recordings.geometry import CameraModel, DistortionModel, Transform, quaternion_from_rotation
 from recordings.mcap.depth_codec import DEPTH_CODEC

@@ -10,8 +10,8 @@ import zstandard
 from jaxtyping import UInt16
 from numpy import ndarray as Array
 
+from recordings.bounded.limits import MOST_PIXELS
 from recordings.errors import DamagedFile
-from recordings.limits import MOST_PIXELS
 
 DEPTH_CODEC = "delta-planes-zstd"
 # Of zstd's settings only the compressor's; any decoder reads the frames. Short matches cost more than they save in the

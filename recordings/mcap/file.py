@@ -27,7 +27,7 @@ from mcap.stream_reader import StreamReader
 from mcap.summary import Summary
 from numpy import ndarray as Array
 
-from recordings import limits
+from recordings.bounded import limits
 from recordings.errors import BadInput, DamagedFile
 from recordings.mcap.writer import LATEST_NS, MAGIC
 

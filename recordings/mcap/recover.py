@@ -9,7 +9,7 @@ from pathlib import Path
 
 from mcap.records import Attachment, Metadata
 
-from recordings.documents import FORMAT_VERSION, as_dict, json_object
+from recordings.bounded.documents import FORMAT_VERSION, as_dict, json_object
 from recordings.errors import BadInput, DamagedFile, TosslabError, WriteFailed
 from recordings.mcap.salvage import SavedMessage, Survey, saved, survey
 from recordings.mcap.scan import Bytes

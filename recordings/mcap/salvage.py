@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Header, MessageIndex, Metadata, Schema, Statistics
 
-from recordings.limits import Budget
+from recordings.bounded.limits import Budget
 from recordings.mcap import scan as mcap_scan
 from recordings.mcap.scan import MESSAGE, Bytes, Record
 from recordings.mcap.writer import MAGIC

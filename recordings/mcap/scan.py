@@ -19,8 +19,8 @@ from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, McapRecord, Metadata, Schema
 
+from recordings.bounded.limits import MOST_CHUNK_BYTES, SEARCHED_TIMES, Budget, unpack
 from recordings.errors import BadInput
-from recordings.limits import MOST_CHUNK_BYTES, SEARCHED_TIMES, Budget, unpack
 from recordings.mcap.file import RAISED
 
 HEAD = struct.Struct("<BQ")

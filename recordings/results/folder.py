@@ -22,9 +22,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray as Array
 
-from recordings.documents import read_json
+from recordings.bounded.documents import read_json
+from recordings.bounded.limits import open_npz, read_npy
 from recordings.errors import BadInput, DamagedFile
-from recordings.limits import open_npz, read_npy
 from recordings.mcap.codec import decode_mask
 from recordings.notices import Notice
 from recordings.results.shape_file import read_shape, write_shape

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Int
 from numpy import ndarray as Array
 
-from recordings.documents import read_json
+from recordings.bounded.documents import read_json
 from recordings.errors import BadInput, DamagedFile
 from recordings.session_writer import write_bytes, write_json
 from recordings.tracks import ObjectShape

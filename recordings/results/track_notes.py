@@ -19,8 +19,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray as Array
 
+from recordings.bounded.limits import open_npz
 from recordings.errors import BadInput, DamagedFile
-from recordings.limits import open_npz
 from recordings.results.folder import Results
 from recordings.session_writer import write_bytes
 

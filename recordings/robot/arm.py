@@ -17,11 +17,11 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray as Array
 
+from recordings.bounded.limits import MOST_JOINTS
+from recordings.bounded.xml_file import read_xml
 from recordings.errors import BadInput
 from recordings.geometry import Transform, rotation_exp
-from recordings.limits import MOST_JOINTS
 from recordings.records import ArmStates
-from recordings.xml_file import read_xml
 
 PANDA_DISTRIBUTION = "example-robot-data"
 PANDA_URDF = "panda_description/urdf/panda.urdf"

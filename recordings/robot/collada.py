@@ -11,9 +11,9 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray as Array
 
+from recordings.bounded.limits import MOST_VERTICES
+from recordings.bounded.xml_file import read_xml
 from recordings.errors import BadInput
-from recordings.limits import MOST_VERTICES
-from recordings.xml_file import read_xml
 
 GREY = (0.5, 0.5, 0.5)
 

@@ -9,7 +9,8 @@ import numpy as np
 from jaxtyping import Float, Int64
 from numpy import ndarray as Array
 
-from recordings import limits, sync
+from recordings import sync
+from recordings.bounded import limits
 from recordings.errors import TosslabError
 from recordings.geometry import CameraModel
 from recordings.given_masks import GivenMasks

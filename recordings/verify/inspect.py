@@ -14,7 +14,7 @@ from jaxtyping import Int64
 from numpy import ndarray as Array
 
 from recordings import sync
-from recordings.documents import as_dict
+from recordings.bounded.documents import as_dict
 from recordings.errors import BadInput, TosslabError
 from recordings.mcap.file import McapFile
 from recordings.session import Session, Toss

@@ -24,8 +24,8 @@ from mcap.records import (
     Statistics,
 )
 
+from recordings.bounded.limits import Budget
 from recordings.errors import BadInput
-from recordings.limits import Budget
 from recordings.mcap import scan as mcap_scan
 from recordings.mcap.scan import MESSAGE, Bytes, Record
 from recordings.mcap.writer import MAGIC

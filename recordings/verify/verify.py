@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from recordings.documents import as_dict, json_object, parse_json, read_document
+from recordings.bounded.documents import as_dict, json_object, parse_json, read_document
 from recordings.errors import BadInput, DamagedFile, TosslabError
 from recordings.progress import Progress, Silent
 from recordings.session import Toss

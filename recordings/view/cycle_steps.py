@@ -24,8 +24,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int64
 from numpy import ndarray as Array
 
+from recordings.bounded.limits import open_npz
 from recordings.errors import BadInput, DamagedFile
-from recordings.limits import open_npz
 from recordings.results.folder import Results, VariantRecord, read_shape, read_track
 from recordings.tracks import ObjectShape, ObjectTrack
 
@@ -152,7 +152,7 @@ class _Reader:
 
     def _learned_on(self, contact: str, toss: int, track: str) -> bool:
         key = self._inputs(contact).get(f"track_{toss:02d}")
-        return self._folder(key) == track and "kept_out" not in self._document(contact).get("counts", {})
+        return self._folder(key) == track and self._document(contact).get("counts", {}).get("kept_out") is None
 
     def _step(self, toss: int, index: int, chain: list[_Names], contact: list[str | None]) -> Step:
         names, learned = chain[index], contact[index]

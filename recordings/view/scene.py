@@ -11,9 +11,9 @@ import numpy as np
 from jaxtyping import Float, Int64
 from numpy import ndarray as Array
 
+from recordings.bounded.mesh_file import load_mesh
 from recordings.errors import BadInput
 from recordings.geometry import Transform
-from recordings.mesh_file import load_mesh
 from recordings.records import StampedPose
 from recordings.results.folder import Masks, Results, VariantRecord, read_masks
 from recordings.results.track_notes import TrackNotes, find_notes

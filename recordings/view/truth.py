@@ -12,10 +12,10 @@ import rerun as rr
 from jaxtyping import Float
 from numpy import ndarray as Array
 
-from recordings.documents import read_json
+from recordings.bounded.documents import read_json
+from recordings.bounded.limits import open_npz
 from recordings.errors import DamagedFile
 from recordings.geometry import quaternion_from_rotation
-from recordings.limits import open_npz
 from recordings.view.layers import Clock, image_entity
 from recordings.view.scene import Scene
 

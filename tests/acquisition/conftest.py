@@ -12,13 +12,14 @@ from typing import Any
 import pytest
 
 from acquisition.drivers.aravis import Aravis
-from acquisition.drivers.synthetic import SyntheticConfig, SyntheticLab, SyntheticThrower
+from acquisition.drivers.synthetic import SyntheticLab, SyntheticThrower
 from acquisition.operator import Nobody
 from acquisition.rig import DeviceEntry, RecordingConfig, Rig
 from acquisition.run import Options, SessionReport, SessionRun, TossReport
 from acquisition.streaming.clock import SessionClock
 from acquisition.streaming.recorder import Recorder
 from acquisition.streaming.streams import Tally
+from acquisition.synthetic.lab_config import SyntheticConfig
 from acquisition.verdict import Verdict
 from recordings.errors import DeviceNotFound
 from recordings.progress import Silent

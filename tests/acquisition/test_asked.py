@@ -24,8 +24,9 @@ from acquisition.arm.workspace import Space
 from acquisition.command import at_speed, the_operator
 from acquisition.devices import GripperCommand, GripperSample, JointTrajectory, Motion
 from acquisition.operator import Keyboard, Nobody, Unattended
+from acquisition.ready_rig import Setup
 from acquisition.rig import Rig, TossConfig, Workspace, find_rig, read_rig
-from acquisition.setup import NO_CALIBRATION, Setup, set_up
+from acquisition.setup import NO_CALIBRATION, set_up
 from acquisition.streaming.recorder import Recorder
 from recordings.errors import BadInput, TosslabError
 from recordings.geometry import Transform

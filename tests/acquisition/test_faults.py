@@ -11,8 +11,9 @@ from typing import Any
 
 import pytest
 
-from acquisition.drivers.synthetic import SyntheticConfig, SyntheticLab
+from acquisition.drivers.synthetic import SyntheticLab
 from acquisition.run import check_disk
+from acquisition.synthetic.lab_config import SyntheticConfig
 from recordings.errors import TosslabError
 from recordings.mcap.sink import Sink
 from recordings.session import Session

@@ -7,11 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from acquisition.drivers.synthetic import SyntheticConfig, SyntheticLab, SyntheticThrower
+from acquisition.drivers.synthetic import SyntheticLab, SyntheticThrower
 from acquisition.preview import Preview
 from acquisition.rig import DeviceEntry, Rig
 from acquisition.streaming.clock import SessionClock
 from acquisition.streaming.recorder import Recorder
+from acquisition.synthetic.lab_config import SyntheticConfig
 from recordings.progress import Silent
 from recordings.view.live import LiveView
 from recordings.view.viewer import ViewerFailed

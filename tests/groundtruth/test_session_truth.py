@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from calibration.tags.detect import TagDetection
 from groundtruth.cli import main
 from groundtruth.graph import Undetermined
-from groundtruth.interpolate import GRAVITY_M_S2, classify, interpolate
+from groundtruth.interpolate import GRAVITY_WORLD_M_S2, classify, interpolate
 from groundtruth.offset import object_from_tagged_by_mesh, tagged_frame
 from groundtruth.session_sightings import (
     TagSeen,
@@ -237,7 +237,7 @@ def arc(times, spin, center):
     poses = np.tile(np.eye(4), (len(times), 1, 1))
     for pose, t in zip(poses, times):
         pose[:3, :3] = Rotation.from_rotvec(np.array(spin) * t).as_matrix()
-        pose[:3, 3] = np.array([0.5, 0.1, 2.0]) * t + 0.5 * GRAVITY_M_S2 * t * t - pose[:3, :3] @ center
+        pose[:3, 3] = np.array([0.5, 0.1, 2.0]) * t + 0.5 * GRAVITY_WORLD_M_S2 * t * t - pose[:3, :3] @ center
     return poses
 
 
@@ -258,9 +258,9 @@ def test_an_impact_is_not_smoothed_over():
     def at(t):
         pose = np.eye(4)
         before, after = min(t, impact), max(t - impact, 0.0)
-        pose[:3, 3] = fall * before + 0.5 * GRAVITY_M_S2 * before**2
-        bounced = (fall + GRAVITY_M_S2 * impact) * [0.8, 1, -0.5]
-        pose[:3, 3] += bounced * after + 0.5 * GRAVITY_M_S2 * after**2
+        pose[:3, 3] = fall * before + 0.5 * GRAVITY_WORLD_M_S2 * before**2
+        bounced = (fall + GRAVITY_WORLD_M_S2 * impact) * [0.8, 1, -0.5]
+        pose[:3, 3] += bounced * after + 0.5 * GRAVITY_WORLD_M_S2 * after**2
         return pose
 
     poses = np.array([at(t) for t in times])

@@ -16,12 +16,13 @@ from processing.config import Config
 from processing.evaluate.table import said
 from processing.field.learn import LearnConfig
 from processing.field.train import FieldConfig
-from processing.pipeline import start_run
+from processing.passes import Pass
 from processing.refine.icp import IcpConfig, ShapeSurface, align_frame
 from processing.refine.image_residuals import JudgeConfig, ShapeDrawer, explain
 from processing.refine.redrawn_frames import RedrawConfig, SecondFrames, redraw
 from processing.sensor.render import RaycastRenderer
-from processing.stages.cycle import Pass, placement
+from processing.stages.place import placement
+from processing.start import start_run
 from processing.variants import TRACKERS, find_variant
 from recordings.geometry import rotation_exp
 from recordings.notices import Notice
@@ -62,8 +63,8 @@ def test_two_tracks_of_one_motion_give_the_motion_between_their_frames_despite_a
     own[7] = np.nan
     found, residual = placement(track_of(own), track_of(shared))
     np.testing.assert_allclose(found, own_from_shared, atol=1e-9)
-    assert residual["frames"] == 11
-    assert residual["rotation_deg"] < 1e-5
+    assert residual.frames == 11
+    assert residual.rotation_deg < 1e-5
 
 
 def test_a_drawn_frame_keeps_the_cameras_depth_where_it_agrees_and_fills_the_rest(tiny_world: Any) -> None:
@@ -228,20 +229,20 @@ def test_contact_without_the_cycle_leaves_the_poses_as_vision_had_them(
 def test_passes_go_on_while_the_raw_images_are_explained_better_and_the_best_is_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from processing.stages import cycle
+    from processing import cycle
 
     judged = iter([0.001, -0.02, -0.01, 0.0005])
-    monkeypatch.setattr(cycle, "_told", lambda *a, **k: {"of": "x", "worse_share": next(judged), "same": False})
-    monkeypatch.setattr(cycle, "with_contact", lambda run, best, name: best)
+    monkeypatch.setattr(cycle, "compared", lambda *a, **k: {"of": "x", "worse_share": next(judged), "same": False})
+    monkeypatch.setattr(cycle, "with_contact", lambda run, best, images, name: best)
     count = iter(range(2, 9))
 
-    def another(*_: Any, **__: Any) -> Pass:
-        return Pass({}, {}, {}, shared_frame=True, notes=(f"made by pass {next(count)}",))
+    def another(*_: Any, **__: Any) -> tuple[Pass, tuple[dict[int, float], dict[int, float]]]:
+        return Pass({}, {}, shared_frame=True, notes=(f"made by pass {next(count)}",)), ({}, {})
 
-    monkeypatch.setattr(cycle, "second_pass", another)
+    monkeypatch.setattr(cycle, "judged_pass", another)
     session = Session.open(SAMPLE)
     run = start_run(session, session.tosses, tmp_path, Config(), TRACKERS[0], lambda _: Silent())
-    ended = cycle.run_cycle(run, find_variant("converged"), Pass({}, {}, {}, shared_frame=True), "x")
+    ended = cycle.run_cycle(run, find_variant("converged"), Pass({}, {}, shared_frame=True), {}, "x")
     assert ended.notes[0] == "made by pass 4"
     assert "pass 5 explains the raw images no better" in ended.notes[-1]
     assert [p["worse_share"] for p in ended.passes] == [0.001, -0.02, -0.01, 0.0005]

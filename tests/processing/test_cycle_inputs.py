@@ -10,22 +10,24 @@ import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 import trimesh
 
+from processing import cycle
 from processing.cli import config_of, main
 from processing.config import Config
 from processing.field.learn import LearnConfig
 from processing.field.train import FieldConfig
-from processing.pipeline import start_run
+from processing.passes import Pass, pose_change
 from processing.refine.image_residuals import SLACK_M, Explained, JudgeConfig, difference, explain
-from processing.stages import cycle
-from processing.stages.contact import contact_stage
-from processing.stages.cycle import Pass, pose_change
+from processing.run import Run
+from processing.stages.contact import ContactResult, learn_contact
+from processing.stages.judge import JudgeResult
+from processing.start import start_run
 from processing.store import Done
 from recordings.progress import Silent
 from recordings.results.folder import Results, read_shape, write_shape, write_track
@@ -136,28 +138,29 @@ def track_of(toss: int, poses: np.ndarray) -> ObjectTrack:
     return ObjectTrack(toss, "d455", "object", np.arange(n) * 33_333_333, poses, status, np.full((n, 6, 6), np.nan))
 
 
-def stage(folder: Path, name: str, counts: dict[str, Any] | None = None) -> Done:
+def stage(folder: Path, name: str, result: Any = None) -> Done:
     (folder / name).mkdir(parents=True)
-    return Done(folder / name, name, counts or {}, reused=True)
+    return Done(folder / name, name, result, reused=True)
 
 
 @pytest.mark.parametrize(("grown_m", "kept_out"), [(4e-4, True), (2e-5, False)])
 def test_contact_that_makes_the_shape_worse_on_raw_depth_is_kept_out_and_said(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, grown_m: float, kept_out: bool
 ) -> None:
-    vision, learned, tracks, masks = (stage(tmp_path, n) for n in ("field", "contact", "register", "segment"))
+    vision, tracks = (stage(tmp_path, n) for n in ("field", "register"))
+    learned = stage(tmp_path, "contact", ContactResult(0.2))
 
-    def judged(run: Any, name: str, tracks: Any, shapes: Any, masks: Any) -> Done:
+    def judged(run: Any, name: str, tracks: Any, shapes: Any, images: Any) -> Done:
         worse_m = grown_m if shapes[0] is learned else 0.0
-        done = stage(tmp_path, f"judge-{shapes[0].key}", {"lost": 0})
+        done = stage(tmp_path, f"judge-{shapes[0].key}", JudgeResult(None, None, None, 24, 0))
         found = rows(1.4e-3 + worse_m + 1e-5 * np.sin(np.arange(24)))
         np.savez(done.folder / "residuals.npz", rows=found.rows)
         return done
 
-    monkeypatch.setattr(cycle, "contact_stage", lambda *_: learned)
-    monkeypatch.setattr(cycle, "judge_stage", judged)
-    start = Pass({0: tracks}, {0: vision}, {0: masks}, shared_frame=True)
-    ended = cycle.with_contact(SimpleNamespace(), start, "all tosses")  # type: ignore[arg-type]
+    monkeypatch.setattr(cycle, "learn_contact", lambda *_: learned)
+    monkeypatch.setattr(cycle, "judge", judged)
+    start = Pass({0: tracks}, {0: vision}, shared_frame=True)
+    ended = cycle.with_contact(Mock(spec=Run), start, {}, "all tosses")  # type: ignore[arg-type]
     assert ended.shapes[0] is (vision if kept_out else learned)
     assert ended.contact[0] is learned  # friction and rollouts are reported all the same
     said = [n for n in ended.warnings if "fits the raw depth worse than vision's (+0.400 mm" in n.text]
@@ -175,10 +178,10 @@ def test_tosses_that_only_fly_teach_no_contact_and_that_is_said(record_tiny: Rec
         world[:, :3, 3] = np.c_[0.3 * time_s, 0.1 * toss * time_s, 2.5 + time_s - 9.81 / 2 * time_s**2]
         camera_from_world = session.calibration.transform("world", "d455").inverse().matrix
         write_track(folder, track_of(toss, camera_from_world @ world))
-        tracks[toss] = Done(folder, "tracks", {}, reused=True)
+        tracks[toss] = Done(folder, "tracks", None, reused=True)
     write_shape(folder, box_shape())
-    done = contact_stage(run, "all tosses", tracks, Done(folder, "shape", {}, reused=True))
-    assert "no contact" in done.counts["kept_out"]
+    done = learn_contact(run, "all tosses", tracks, Done(folder, "shape", None, reused=True))
+    assert "no contact" in str(done.result.kept_out)
     np.testing.assert_array_equal(read_shape(done.folder).vertices_m, read_shape(folder).vertices_m)
 
 
@@ -215,7 +218,7 @@ def test_a_toss_of_another_object_is_lost_counted_and_not_learned_from(two_objec
     document = json.loads((results.path / "table.json").read_text())
     assert [t["lost"] for t in document["rows"][0]["per_toss"]] == [0, 5]
     contact = [json.loads(p.read_text())["counts"] for p in results.path.glob("contact-*/stage.json")]
-    assert all("toss 1" in c["kept_out"] if "kept_out" in c else "1" in c["left_out"] for c in contact)
+    assert all("toss 1" in c["kept_out"] if c["kept_out"] else "1" in c["left_out"] for c in contact)
     size = np.ptp(results.shape("ours", "all").vertices_m, axis=0)
     assert size.max() < 0.14  # the other object is 14 cm long
 
@@ -248,7 +251,7 @@ def test_a_disk_full_in_the_second_pass_is_one_message_and_keeps_all_before_it(
     def full(*_: Any) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr("processing.stages.second_pass.write_masks", full)
+    monkeypatch.setattr("processing.stages.reproject.write_masks", full)
     assert main([str(session), "--out", str(out)]) == 2
     assert "is full. Every finished stage is kept" in capsys.readouterr().err
     assert {p.name for p in out.iterdir()} == kept

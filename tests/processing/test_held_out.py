@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -11,13 +11,20 @@ import pytest
 import trimesh
 
 from processing.config import Config
+from processing.cycle import judged_pass, with_contact
 from processing.evaluate.truth import open_truth
 from processing.field.learn import LearnConfig
 from processing.field.train import FieldConfig
-from processing.pipeline import Run, start_run
-from processing.stages.cycle import Pass, certain_share, judged_pass, with_contact
-from processing.stages.held_out import Half, halves_of, held_out_losses, learned_by, why_no_halves
-from processing.stages.masks import object_masks, static_scene
+from processing.images import raw_images
+from processing.passes import Pass, certain_share
+from processing.run import Run
+from processing.stages.contact import learn_contact
+from processing.stages.find import find_object
+from processing.stages.held_out import Half, halves_of, judge_by_contact, losses_of, why_no_halves
+from processing.stages.rig import refine_rig
+from processing.stages.scene import learn_static_scene
+from processing.stages.segment import segment
+from processing.start import start_run
 from processing.store import Done
 from recordings.progress import Silent
 from recordings.results.folder import read_shape, read_track, write_shape, write_track
@@ -41,7 +48,7 @@ def true_tracks(run: Run) -> dict[int, Done]:
     assert truth is not None
     found = {}
     for toss in run.tosses:
-        times_ns = run.frames(toss).times_ns
+        times_ns = run.session.toss(toss).rgbd().times_ns
         empty = ObjectTrack.nowhere(toss, "d455", times_ns)
         poses = truth.camera_from_object(empty)
         assert poses is not None
@@ -58,29 +65,42 @@ def true_shape(run: Run) -> Done:
     return stored_shape(run, ObjectShape("object", "test", np.asarray(mesh.vertices), np.asarray(mesh.faces)))
 
 
-def stored_track(run: Run, track: ObjectTrack) -> Done:
-    def write(folder: Path) -> dict[str, int]:
-        write_track(folder, track)
-        return {}
+@dataclass(frozen=True)
+class Stored:
+    frames: int = 1
+    lost: int = 0
 
-    return run.store.run("track", 1, {}, {"poses": str(float(np.nansum(track.camera_from_object)))}, write)
+
+def learned_by(run: Run, halves: tuple[Half, ...], tracks: dict[int, Done]) -> tuple[Half, ...]:
+    return tuple(
+        replace(h, contact=learn_contact(run, f"test, {h.name}", {t: tracks[t] for t in h.learned_from}, h.shape))
+        for h in halves
+    )
+
+
+def stored_track(run: Run, track: ObjectTrack) -> Done:
+    def write(folder: Path) -> Stored:
+        write_track(folder, track)
+        return Stored()
+
+    return run.store.run("track", 1, {}, {"poses": str(float(np.nansum(track.camera_from_object)))}, Stored, write)
 
 
 def stored_shape(run: Run, shape: ObjectShape) -> Done:
-    def write(folder: Path) -> dict[str, int]:
+    def write(folder: Path) -> Stored:
         write_shape(folder, shape)
-        return {}
+        return Stored()
 
-    return run.store.run("shape", 1, {}, {"size": str(float(np.ptp(shape.vertices_m)))}, write)
+    return run.store.run("shape", 1, {}, {"size": str(float(np.ptp(shape.vertices_m)))}, Stored, write)
 
 
 @pytest.fixture(scope="module")
 def halves(run: Run, true_tracks: dict[int, Done], true_shape: Done) -> tuple[Half, ...]:
-    return learned_by(run, halves_of(true_tracks, dict.fromkeys(true_tracks, true_shape)), true_tracks, "test")
+    return learned_by(run, halves_of(true_tracks, dict.fromkeys(true_tracks, true_shape)), true_tracks)
 
 
 def losses_of_shape(run: Run, tracks: dict[int, Done], halves: tuple[Half, ...], shape: Done) -> dict[int, float]:
-    return held_out_losses(run, "test", tracks, [replace(h, shape=shape) for h in halves])
+    return losses_of([judge_by_contact(run, "test", tracks, replace(h, shape=shape)) for h in halves])
 
 
 def test_a_shape_stretched_along_one_axis_has_the_larger_loss_on_every_toss_held_out_both_ways(
@@ -108,7 +128,7 @@ def test_what_judges_a_toss_is_the_same_whatever_that_toss_did(
 ) -> None:
     judged = halves[0].judged
     moved = {t: lifted(run, t, d) if t in judged else d for t, d in true_tracks.items()}
-    again = learned_by(run, halves_of(moved, dict.fromkeys(moved, true_shape)), moved, "test")
+    again = learned_by(run, halves_of(moved, dict.fromkeys(moved, true_shape)), moved)
     before, after = ([None if h.contact is None else h.contact.key for h in found] for found in (halves, again))
     assert after[0] == before[0] is not None
     assert after[1] != before[1]
@@ -127,13 +147,15 @@ def test_no_contact_of_a_toss_is_in_the_second_pass_shape_that_it_is_judged_by(
     run: Run, true_tracks: dict[int, Done], true_shape: Done
 ) -> None:
     """Walks back through the stages that the judging shapes were made from."""
-    scene = static_scene(run)
-    masks = {t: object_masks(run, t, scene) for t in run.tosses}
+    scene = learn_static_scene(run)
+    rig = refine_rig(run, scene)
+    found = find_object(run, scene, rig)
+    images = {t: raw_images(run, t, rig, segment(run, t, scene, rig, found)) for t in run.tosses}
     shapes = dict.fromkeys(true_tracks, true_shape)
-    start = Pass(true_tracks, shapes, masks, shared_frame=True, halves=halves_of(true_tracks, shapes))
-    refined = with_contact(run, start, "test")
+    start = Pass(true_tracks, shapes, shared_frame=True, halves=halves_of(true_tracks, shapes))
+    refined = with_contact(run, start, images, "test")
     assert refined.shapes[0].key != true_shape.key, "contact's shape must take part, or nothing is shown"
-    after, losses = judged_pass(run, start, refined, "test", icp=False)
+    after, losses = judged_pass(run, start, refined, images, "test", icp=False)
     assert [sorted(x) for x in losses] == [list(run.tosses)] * 2
     for half in after.halves:
         assert half.shape.key != after.shapes[0].key

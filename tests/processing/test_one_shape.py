@@ -11,25 +11,31 @@ import pytest
 
 from processing import pipeline
 from processing.config import Config
-from processing.pipeline import Run, start_run
-from processing.stages.one_shape import _fused_stage, _left, of_one_shape
+from processing.images import Images, TossImages
+from processing.one_shape import _left, kept_apart
+from processing.run import Run
+from processing.stages.fuse import fuse_frames
+from processing.stages.register import RegisterResult
+from processing.stages.track import TrackResult
+from processing.start import start_run
 from processing.store import Done
 from recordings.geometry import rotation_exp
 from recordings.progress import Silent
-from recordings.results.folder import write_masks, write_track
-from recordings.session import Session
+from recordings.results.folder import read_masks, write_masks, write_track
+from recordings.session import RgbdFrames, Session
 from recordings.tracks import ObjectTrack
 
 
 def stages(
     tiny_world: Any, run: Run, folder: Path, turned: int | None, narrower_px: int = 0
-) -> tuple[Done, dict[int, Done]]:
+) -> tuple[Done, dict[int, Images]]:
     """True poses as the stage of all tosses, one of them turned about the object's middle, and true masks (or narrower
     ones)."""
-    tracks, masks = folder / "register-0", {}
+    tracks, images = folder / "register-0", {}
     tracks.mkdir(parents=True)
     for toss in run.tosses:
-        times_ns = run.frames(toss).times_ns
+        frames = run.session.toss(toss).rgbd()
+        times_ns = frames.times_ns
         poses = [(tiny_world.world_from_camera.inverse() @ p).matrix for p in tiny_world.poses(len(times_ns), toss)]
         turn = np.eye(4)
         if toss == turned:
@@ -45,31 +51,39 @@ def stages(
         seen = [tiny_world.see(p, i)[1].astype(np.uint8) for i, p in enumerate(tiny_world.poses(n, toss))]
         kernel = np.ones((2 * narrower_px + 1, 2 * narrower_px + 1), np.uint8)
         write_masks(own, toss, [cv2.erode(mask, kernel) > 0 for mask in seen], np.ones(n))
-        masks[toss] = Done(own, f"masks {toss} {turned} {narrower_px}", {}, False)
-    return Done(tracks, f"tracks {turned}", {}, False), masks
+        images[toss] = seen_as(toss, frames, own, f"masks {toss} {turned} {narrower_px}")
+    return Done(tracks, f"tracks {turned}", None, False), images
 
 
-@pytest.mark.parametrize(("turned", "kept", "apart"), [(None, [0, 1, 2], []), (1, [0, 2], [1])])
+def seen_as(toss: int, frames: RgbdFrames, masks: Path, key: str) -> Images:
+    def opened() -> TossImages:
+        seen = read_masks(masks, toss)
+        return TossImages(frames, frames.depth_times_ns, seen, seen.confidence, None, None)
+
+    return Images(toss, {"masks": key}, opened)
+
+
+@pytest.mark.parametrize(("turned", "apart"), [(None, ()), (1, (1,))])
 def test_a_toss_that_is_turned_against_the_others_is_kept_apart(
-    tiny_world: Any, tmp_path: Path, turned: int | None, kept: list[int], apart: list[int]
+    tiny_world: Any, tmp_path: Path, turned: int | None, apart: tuple[int, ...]
 ) -> None:
     session = Session.open(tiny_world.record(tmp_path / "tiny", tosses=(0, 1, 2), frames=6))
     run = start_run(session, session.tosses, tmp_path / "out", Config(), "multi-hypothesis", lambda _: Silent())
-    together, masks = stages(tiny_world, run, tmp_path, turned)
-    fused = _fused_stage(run, together, masks)
-    assert of_one_shape(run, together, fused, masks, list(session.tosses)) == (kept, apart)
+    together, images = stages(tiny_world, run, tmp_path, turned)
+    fused = fuse_frames(run, together, images, session.tosses)
+    assert kept_apart(run, together, fused, images, session.tosses) == apart
 
 
 def test_tosses_whose_masks_are_bad_alike_are_not_kept_apart(tiny_world: Any, tmp_path: Path) -> None:
     """No shape explains such masks well, that of all tosses no worse than that of each alone."""
     session = Session.open(tiny_world.record(tmp_path / "tiny", tosses=(0, 1), frames=6))
     run = start_run(session, session.tosses, tmp_path / "out", Config(), "multi-hypothesis", lambda _: Silent())
-    together, masks = stages(tiny_world, run, tmp_path, None, narrower_px=2)
-    true_masks = stages(tiny_world, run, tmp_path / "true", None)[1]
-    fused = _fused_stage(run, together, true_masks)
-    left = _left(run, together, dict.fromkeys((0, 1), fused), masks)
+    together, images = stages(tiny_world, run, tmp_path, None, narrower_px=2)
+    true_images = stages(tiny_world, run, tmp_path / "true", None)[1]
+    fused = fuse_frames(run, together, true_images, (0, 1))
+    left = _left(run, together, dict.fromkeys((0, 1), fused), images)
     assert max(left.values()) > run.config.cycle.apart_mask
-    assert of_one_shape(run, together, _fused_stage(run, together, masks), masks, [0, 1]) == ([0, 1], [])
+    assert kept_apart(run, together, fuse_frames(run, together, images, (0, 1)), images, [0, 1]) == ()
 
 
 def test_the_others_are_joined_anew_without_a_toss_that_is_kept_apart(
@@ -77,23 +91,21 @@ def test_the_others_are_joined_anew_without_a_toss_that_is_kept_apart(
 ) -> None:
     session = Session.open(tiny_world.record(tmp_path / "tiny", tosses=(0, 1, 2), frames=2))
     run = start_run(session, session.tosses, tmp_path / "out", Config(), "multi-hypothesis", lambda _: Silent())
-    once = {t: Done(tmp_path, f"track {t}", {"unfit": int(t == 1)}, False) for t in run.tosses}
-    masks = {t: Done(tmp_path, f"masks {t}", {}, False) for t in run.tosses}
+    alone = {t: Done(tmp_path, f"track {t}", TrackResult(2, 0, 0, unfit=int(t == 1)), False) for t in run.tosses}
 
-    def register(_: Run, tracks: dict[int, Done], __: dict[int, Done]) -> Done:
-        return Done(tmp_path, f"together {sorted(tracks)}", {"not_joined": []}, False)
+    def register(_: Run, tracks: dict[int, Done], __: Any) -> Done[RegisterResult]:
+        return Done(tmp_path, f"together {sorted(tracks)}", RegisterResult((), (), ()), False)
 
-    def field(_: Run, name: str, tracks: dict[int, Done], __: dict[int, Done]) -> Done:
-        return Done(tmp_path, f"{name} {sorted(tracks)}", {}, False)
+    def field(_: Run, name: str, tracks: dict[int, Done], __: Any) -> Done:
+        return Done(tmp_path, f"{name} {sorted(tracks)}", None, False)
 
-    def one_shape(_: Run, __: Done, ___: Done, ____: dict[int, Done], joined: list[int]) -> tuple[list[int], list[int]]:
-        return [t for t in joined if t != 1], [t for t in joined if t == 1]
+    def apart(_: Run, __: Done, ___: Done, ____: Any, joined: list[int]) -> tuple[int, ...]:
+        return tuple(t for t in joined if t == 1)
 
-    for name, fake in (("register_stage", register), ("field_stage", field), ("of_one_shape", one_shape)):
+    for name, fake in (("register", register), ("learn_field", field), ("kept_apart", apart)):
         monkeypatch.setattr(pipeline, name, fake)
-    found = pipeline._all_together(run, once, masks)
+    found = pipeline.first_pass(run, alone, {})
     assert {t: d.key for t, d in found.tracks.items()} == {0: "together [0, 2]", 2: "together [0, 2]"}
     assert {d.key for d in found.shapes.values()} == {"all tosses [0, 2]"}
-    assert list(found.masks) == [0, 2]
     assert not found.shared_frame
     assert [w.text.split(":")[0] for w in found.warnings] == ["toss 1", "tosses [1]"]

@@ -7,8 +7,8 @@ from collections.abc import Callable
 from dataclasses import replace
 from html import escape
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import cv2
 import numpy as np
@@ -16,12 +16,15 @@ import pytest
 
 from processing import stage_notices
 from processing.cli import config_of, main
+from processing.config import CycleConfig
 from processing.contact.report.result import left_out_notice
 from processing.evaluate.table import summary
 from processing.field.learn import LearnConfig
 from processing.field.train import FieldConfig
-from processing.stages.cycle import _said
-from processing.stages.second_pass import CycleConfig
+from processing.run import Run
+from processing.stages.rig import RigResult
+from processing.stages.segment import SegmentResult
+from processing.stages.track import TrackResult
 from processing.store import Done
 from recordings.importers.folder import import_folder
 from recordings.notices import Notice
@@ -31,8 +34,17 @@ from recordings.session import Session
 UR5E = tuple(f"{n}_joint" for n in ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3"))
 
 
-def done(folder: Path = Path("x"), **counts: Any) -> Done:
-    return Done(folder, "key", counts, reused=False)
+def done(result: Any, folder: Path = Path("x")) -> Done:
+    return Done(folder, "key", result, reused=False)
+
+
+def rig_of(robot: Any, scale: float = 1.0, sigma: float | None = None) -> Done[RigResult]:
+    return done(RigResult(scale, scale, sigma, {}, robot))
+
+
+def masks_of(others_moving: int = 0, without_depth: int = 0) -> Done[SegmentResult]:
+    followed = {"others_moving": others_moving, "badly_exposed": 0}
+    return done(SegmentResult(20, 0, without_depth=without_depth, followed=followed))
 
 
 def still_arm() -> ArmStates:
@@ -84,7 +96,7 @@ def test_a_mask_that_was_empty_at_import_is_said_of_its_toss(data: Callable[[str
     cv2.imwrite(str(tmp_path / "in" / "toss_00" / "mask_first.png"), np.zeros_like(mask))
     import_folder(tmp_path / "in", tmp_path / "session")
     with Session.open(tmp_path / "session") as session:
-        [notice] = stage_notices.of_import(SimpleNamespace(session=session, recorded=(0,)))  # type: ignore[arg-type]
+        [notice] = stage_notices.of_import(Mock(spec=Run, session=session, recorded=(0,)))  # type: ignore[arg-type]
     assert notice.text == "toss 0: mask_first.png is empty, so it was left out"
 
 
@@ -92,43 +104,44 @@ def test_a_robot_whose_place_was_not_refined_and_a_corrected_depth_scale_are_sai
     record_tiny: Callable[..., Path],
 ) -> None:
     with Session.open(record_tiny(frames=2, tosses=(0,))) as session:
-        run: Any = SimpleNamespace(session=session, recorded=(0,))
+        run: Any = Mock(spec=Run, session=session, recorded=(0,))
         robot = "place not refined: it is seen in too few frames"
-        place, scale = stage_notices.of_rig(run, done(robot=robot, depth_scale=1.004, scale_sigma=0.0005))
+        place, scale = stage_notices.of_rig(run, rig_of(robot, 1.004, 0.0005))
         assert "too few frames" in place.seen
         assert "toss-calibrate hand-eye" in place.do
         assert "0.40 +- 0.05 % too far" in scale.seen
-        assert stage_notices.of_rig(run, done(robot={"moved_mm": 1}, depth_scale=1.0)) == []
+        assert stage_notices.of_rig(run, rig_of({"moved_mm": 1})) == []
         nobody = "no joint states of a Franka Panda in these tosses"
-        assert stage_notices.of_rig(run, done(robot=nobody, depth_scale=1.0)) == []  # thrown by hand: nothing to say
+        assert stage_notices.of_rig(run, rig_of(nobody)) == []  # thrown by hand: nothing to say
 
 
 def test_others_that_move_and_frames_without_depth_are_said_of_their_toss() -> None:
-    others, bare = stage_notices.of_masks(3, done(frames=20, others_moving=4, without_depth=2, badly_exposed=0))
+    others, bare = stage_notices.of_masks(3, masks_of(4, 2))
     assert "toss 3: in 4 of 20 frames something else" in others.seen
     assert "toss 3: 2 of 20 frames came without a depth image" in bare.seen
-    assert stage_notices.of_masks(3, done(frames=20, others_moving=0, without_depth=0, badly_exposed=0)) == []
+    assert stage_notices.of_masks(3, masks_of()) == []
 
 
 def test_few_frames_that_no_pose_fits_are_most_likely_noise_and_many_are_most_likely_a_wrong_mask() -> None:
-    [few], [many] = (stage_notices.of_track(1, done(frames=35, unfit=n)) for n in (9, 25))
+    [few], [many] = (stage_notices.of_track(1, done(TrackResult(35, 0, 0, n))) for n in (9, 25))
     assert "in 9 of 35 frames" in few.seen
     assert few.do.index("noisy depth") < few.do.index("not rigid")
     assert many.do.index("mask") < many.do.index("not rigid")
-    assert stage_notices.of_track(1, done(frames=35, unfit=0)) == []
+    assert stage_notices.of_track(1, done(TrackResult(35, 0, 0))) == []
 
 
 def test_what_contact_says_of_itself_is_read_from_its_result(tmp_path: Path) -> None:
     said = left_out_notice(2, "it jumps at frame 50")
     (tmp_path / "result.json").write_text(json.dumps({"warnings": [said.to_json()]}))
-    assert stage_notices.of_contact(done(tmp_path)) == [said]
-    assert stage_notices.of_contact(done(tmp_path / "kept_out")) == []
+    assert stage_notices.of_contact(done(None, tmp_path)) == [said]
+    assert stage_notices.of_contact(done(None, tmp_path / "kept_out")) == []
 
 
 def test_of_a_second_pass_it_is_said_that_it_was_kept_and_what_that_means() -> None:
     told = {"of": "all tosses", "same": False, "worse_share": 0.007}
-    [worse] = _said(told, CycleConfig())
+    [worse] = stage_notices.second_pass_kept(told, CycleConfig())
     assert worse.startswith("all tosses: the second pass was kept: it explains the raw images as well as the first")
     assert "0.7 % worse" in worse
-    assert "was kept: it explains the raw images better" in _said({**told, "worse_share": -0.1}, CycleConfig())[0]
-    assert "only repeats" in _said({**told, "same": True}, CycleConfig())[0]
+    better = stage_notices.second_pass_kept({**told, "worse_share": -0.1}, CycleConfig())
+    assert "was kept: it explains the raw images better" in better[0]
+    assert "only repeats" in stage_notices.second_pass_kept({**told, "same": True}, CycleConfig())[0]

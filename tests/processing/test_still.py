@@ -14,8 +14,9 @@ import pytest
 from processing.config import Config
 from processing.field.learn import LearnConfig
 from processing.field.train import FieldConfig
-from processing.pipeline import process, start_run
+from processing.pipeline import process
 from processing.sensor.still import StillSettings, kept_of, still_stretches
+from processing.start import start_run
 from processing.variants import rows_of
 from recordings.progress import Silent
 from recordings.records import RgbdFrame

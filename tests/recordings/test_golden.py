@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from recordings.documents import FORMAT_VERSION
+from recordings.bounded.documents import FORMAT_VERSION
 from recordings.mcap.codec import decode_image
 from recordings.records import HealthLine, TossEvent
 from recordings.session import Session

@@ -18,10 +18,10 @@ from typing import Any
 
 import pytest
 
-from recordings.documents import parse_json
+from recordings.bounded.documents import parse_json
+from recordings.bounded.limits import Budget, image_size, unpack
 from recordings.errors import BadInput, DamagedFile
 from recordings.importers.images import read_depth_png
-from recordings.limits import Budget, image_size, unpack
 from recordings.mcap.codec import decode_image, decode_mask
 from recordings.records import EncodedImage
 
@@ -32,7 +32,8 @@ import gc, json, os, resource, sys, time
 from pathlib import Path
 import cv2, lz4.frame, numpy, rosbags.rosbag1, rosbags.rosbag2, rosbags.typesys, scipy.spatial.transform, trimesh, yaml
 from recordings.errors import TosslabError
-import recordings.importers.ros_bounds, recordings.importers.realsense, recordings.verify.verify, recordings.mcap.recover
+import recordings.importers.ros_bounds, recordings.importers.realsense, recordings.verify.verify
+import recordings.mcap.recover
 import recordings.importers.folder, recordings.importers.bundlesdf, recordings.importers.contactnets
 import recordings.importers.rosbag, groundtruth.tagslam.detections, groundtruth.tagslam.yaml_pieces
 import recordings.robot.collada, recordings.robot.arm
@@ -97,7 +98,7 @@ READERS = {
     "hand": ("from recordings.results.folder import read_hand", "read_hand(path.parent, 0)"),
     "shape": ("from recordings.results.folder import read_shape", "read_shape(path.parent)"),
     "results": ("from recordings.results.folder import Results", "Results.open(path.parent.parent)"),
-    "mesh": ("from recordings.mesh_file import load_mesh", "load_mesh(path)"),
+    "mesh": ("from recordings.bounded.mesh_file import load_mesh", "load_mesh(path)"),
     "urdf": ("from recordings.robot.arm import read_urdf", "read_urdf(path)"),
     "collada": ("from recordings.robot.collada import read_collada", "read_collada(path)"),
     "weights": ("from processing.published_weights import XFEAT, read_weights", "read_weights(path, XFEAT)"),

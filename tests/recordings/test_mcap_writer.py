@@ -208,7 +208,7 @@ WRITE_FOR_EVER = """
 import sys, time
 sys.path.insert(0, sys.argv[2])
 from pathlib import Path
-from recordings.mcap_writer import McapWriter
+from recordings.mcap.writer import McapWriter
 writer = McapWriter(Path(sys.argv[1]))
 channel = writer.channel("/a", "x", 0)
 print("go", flush=True)

@@ -15,8 +15,8 @@ from mcap.writer import Writer as PlainWriter
 from recordings.errors import BadInput, DamagedFile, TosslabError, WriteFailed
 from recordings.geometry import CameraModel, Transform
 from recordings.mcap.codec import decode_image
+from recordings.mcap.recover_session import recover
 from recordings.records import EncodedImage, TossWindow
-from recordings.recover_session import recover
 from recordings.session import Session
 from recordings.session_writer import SessionWriter, TossWriter
 from recordings.tracks import RigCalibration

@@ -24,7 +24,8 @@ from numpy import ndarray as Array
 
 from processing.contact.physics.loss import REFERENCE_MASS_KG
 from processing.motion.phases import Noise
-from processing.motion.trajectory import GRAVITY_M_S2, rotation_matrices, rotation_vectors
+from processing.motion.trajectory import rotation_matrices, rotation_vectors
+from recordings.constants import GRAVITY_M_S2
 
 STEP_S = 1 / 592
 """Of the rollouts: in steps of 1/148 s friction comes out a tenth lower."""

@@ -15,8 +15,10 @@ from jaxtyping import Float
 from numpy import ndarray as Array
 from scipy.spatial.transform import Rotation
 
-from processing.motion.phases import LEAST_SIGMA_M, TO_SIGMA, Phases
-from processing.motion.trajectory import GRAVITY_M_S2, PoseSeries, differences
+from processing.motion.impacts import DATA_CHECK_IMPACT_M_S
+from processing.motion.phases import LEAST_SIGMA_M, Phases
+from processing.motion.trajectory import PoseSeries, differences
+from recordings.constants import GRAVITY_M_S2, MAD_TO_SIGMA
 from recordings.errors import BadInput
 
 LEAST_FRAMES = 5
@@ -38,7 +40,6 @@ MOST_FALL_ERROR_M_S2 = 0.4
 """A window that knows its acceleration less well proves nothing."""
 SAME_HEIGHT_M, SAME_TILT = 1e-8, 1e-5
 SAME_FRAMES = 30
-IMPACT_M_S = 0.3
 
 
 def check_frames(series: PoseSeries) -> None:
@@ -76,7 +77,7 @@ def measured_fall(tosses: Sequence[PoseSeries]) -> Fall | None:
         return None
     values, errors = np.array([f.value for f in found]), np.array([f.error for f in found])
     middle = float(np.median(values))
-    spread = TO_SIGMA * float(np.median(np.abs(values - middle)))  # at 30 Hz some windows are bounces, and scatter
+    spread = MAD_TO_SIGMA * float(np.median(np.abs(values - middle)))  # at 30 Hz some windows are bounces, and scatter
     return Fall(middle, 1.25 * max(spread, float(np.sqrt((errors**2).mean()))) / len(found) ** 0.5)
 
 
@@ -132,7 +133,7 @@ def check_fall(tosses: Sequence[PoseSeries]) -> float | None:
         raise BadInput(f"free fall accelerates upwards ({fall:.2f} m/s^2): z of `world` must point up, against gravity")
     step = tosses[0].step_s
     raise BadInput(
-        f"free fall reads {-fall:.2f} m/s^2 instead of 9.81: either the time step is wrong ({step * 1e3:.3f} "
+        f"free fall reads {-fall:.2f} m/s^2 instead of {GRAVITY_M_S2}: either the time step is wrong ({step * 1e3:.3f} "
         "ms is said, "
         f"{step * 1e3 * (-fall / GRAVITY_M_S2) ** 0.5:.3f} ms would fit) or the scale (1 m in the data would be "
         f"{GRAVITY_M_S2 / -fall:.4f} m); import it again with the right `--dt` or `--scale`"
@@ -163,7 +164,7 @@ def impact_angle(tosses: Sequence[PoseSeries], inertia: Float[Array, "3 3"]) -> 
         dv = np.diff(states.velocity_world_m_s[1:], axis=0) - np.diff(series.time_s)[1:, None] * gravity
         momentum = np.einsum("nij,jk,nk->ni", states.rotation, inertia, states.spin_object_rad_s)[1:]
         dL = np.diff(momentum, axis=0)
-        hit = np.linalg.norm(dv, axis=1) > IMPACT_M_S
+        hit = np.linalg.norm(dv, axis=1) > DATA_CHECK_IMPACT_M_S
         across += float(np.abs((dL * dv).sum(1))[hit].sum())
         along += float((np.linalg.norm(dL, axis=1) * np.linalg.norm(dv, axis=1))[hit].sum())
         count += int(hit.sum())

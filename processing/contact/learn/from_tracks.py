@@ -33,7 +33,8 @@ from processing.contact.physics.plane import Plane
 from processing.contact.physics.support import surface_samples
 from processing.contact.report.result import left_out_notice, result_document, warnings_of
 from processing.contact.report.rollout_errors import FIGURE_4_STEPS, Evaluation, evaluate
-from processing.motion.trajectory import GRAVITY_M_S2, PoseSeries
+from processing.motion.trajectory import PoseSeries
+from recordings.constants import GRAVITY_M_S2
 from recordings.errors import BadInput
 from recordings.geometry import Transform
 from recordings.progress import Progress, Silent

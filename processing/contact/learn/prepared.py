@@ -14,7 +14,8 @@ from processing.contact.learn.prior import Frame
 from processing.contact.physics.plane import Plane
 from processing.contact.physics.rollout import Start
 from processing.motion.smoother import Smoothed, smooth
-from processing.motion.trajectory import GRAVITY_M_S2, PoseSeries, States, Steps, differences, steps_of
+from processing.motion.trajectory import PoseSeries, States, Steps, differences, steps_of
+from recordings.constants import GRAVITY_M_S2
 from recordings.errors import BadInput
 
 

@@ -1,4 +1,7 @@
-"""Is a shape better or worse, without truth? By the contact loss at given poses (raw depth: processing/refine/image_residuals.py)."""
+"""Is a shape better or worse, without truth? By the contact loss at given poses.
+
+What raw depth says of a shape: processing/refine/image_residuals.py.
+"""
 
 from __future__ import annotations
 

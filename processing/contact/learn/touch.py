@@ -23,7 +23,8 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray as Array
 
 from processing.motion.phases import pose_noise
-from processing.motion.trajectory import GRAVITY_M_S2, PoseSeries
+from processing.motion.trajectory import PoseSeries
+from recordings.constants import GRAVITY_M_S2
 
 LEAST_LOAD_G, MOST_LOAD_G = 0.3, 2.5
 """What the plane carries in a frame, in weights of the body; the frames beside it may carry twice the most."""

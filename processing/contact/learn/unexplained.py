@@ -23,6 +23,7 @@ from processing.contact.physics.loss import (
     point_velocity,
 )
 from processing.contact.physics.solver import solve_cones
+from recordings.constants import MAD_TO_SIGMA
 
 REACH_M = 0.01
 """A point this high above the plane after the step may still have touched it during the step."""
@@ -56,5 +57,5 @@ def unexplained_m_s(data: StepData, body: Body, contacts: int) -> Float[Tensor, 
 def unexplained_rows(data: StepData, body: Body, contacts: int) -> Bool[Tensor, " n"]:
     """Transitions that the plane cannot explain: beyond LEAST_M_S and beyond SIGMAS of what is usual in this data."""
     left = unexplained_m_s(data, body, contacts)
-    usual = 1.4826 * left.median()
+    usual = MAD_TO_SIGMA * left.median()
     return left > torch.clamp(SIGMAS * usual, min=LEAST_M_S)

@@ -28,7 +28,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from processing.contact.physics.solver import in_cone, solve_cones
-from processing.motion.trajectory import GRAVITY_M_S2, Steps
+from processing.motion.trajectory import Steps
+from recordings.constants import GRAVITY_M_S2
 
 REFERENCE_MASS_KG = 0.37
 EPSILON = 1e-3

@@ -19,7 +19,8 @@ from torch import Tensor
 from processing.contact.friction.forecast import STEP_S, Law
 from processing.contact.physics.loss import REFERENCE_MASS_KG, Body, jacobian, point_velocity
 from processing.contact.physics.solver import in_cone, solve_cones
-from processing.motion.trajectory import GRAVITY_M_S2, PoseSeries, rotation_matrices, rotation_vectors
+from processing.motion.trajectory import PoseSeries, rotation_matrices, rotation_vectors
+from recordings.constants import GRAVITY_M_S2
 
 EPSILON = 1e-4
 TOLERANCE = 1e-6

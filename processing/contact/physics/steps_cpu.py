@@ -14,7 +14,7 @@ from numba import njit
 
 from processing.contact.physics.solver import FLAT_ENOUGH, MOST_ITERATIONS, SEARCH_STEPS
 from processing.contact.physics.solver_cpu import solve_rows
-from processing.motion.trajectory import GRAVITY_M_S2
+from recordings.constants import GRAVITY_M_S2
 
 SLOWEST_REBOUND_M_S = 0.03
 CLOSING_M_S = 3.0

@@ -1,7 +1,7 @@
 """How much too far the depth camera reports: its view of the table against where the calibration has the table.
 
 A depth that is too large by a factor moves a plane to a parallel one. So a tilt between the two planes is the
-calibration's own error, and tells how far its distance to the table may be off as well.
+calibration's own error, and shows how far its distance to the table may be off as well.
 """
 
 from __future__ import annotations
@@ -9,8 +9,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float32
-from numpy import ndarray as Array
 
 from processing.segment.background.static_scene import StaticScene, fit_plane
 from recordings.geometry import CameraModel, Transform
@@ -18,7 +16,7 @@ from recordings.geometry import CameraModel, Transform
 
 @dataclass(frozen=True)
 class DepthScaleSettings:
-    """When a depth scale is believed."""
+    """When a depth scale is accepted."""
 
     near_table_m: float = 0.03
     """Scene points this near to the calibrated table plane may be the table."""
@@ -48,7 +46,7 @@ class TableScale:
 def table_scale(
     scene: StaticScene, camera: CameraModel, world_from_camera: Transform, settings: DepthScaleSettings
 ) -> TableScale | None:
-    """The depth scale that the table tells; None where the table is hardly seen."""
+    """The depth scale that the table shows; None where the table is hardly seen."""
     s = settings
     near = (scene.table_depth_m > 0) & scene.known & (scene.depth_m > 0)
     near &= np.abs(scene.depth_m - scene.table_depth_m) < s.near_table_m * np.maximum(1.0, scene.table_depth_m)
@@ -70,12 +68,7 @@ def table_scale(
     return TableScale(scale, float(np.hypot(sigma_m / height_m, s.sensor_sigma)), np.degrees(tilt_rad), int(near.sum()))
 
 
-def believed(scale: float, sigma: float, settings: DepthScaleSettings) -> float:
+def accepted_scale(scale: float, sigma: float, settings: DepthScaleSettings) -> float:
     """The scale to correct depth by: 1 where it is not significantly another."""
     significant = np.isfinite(sigma) and abs(scale - 1) > settings.significant * sigma
     return scale if significant else 1.0
-
-
-def corrected_depth(depth_m: Float32[Array, "h w"], scale: float) -> Float32[Array, "h w"]:
-    """True depth of what a camera with this scale reports; 0 stays 0."""
-    return depth_m if scale == 1.0 else (depth_m / np.float32(scale)).astype(np.float32)

@@ -12,11 +12,11 @@ from numpy import ndarray as Array
 from processing.segment.background.color_model import Likeness
 from processing.segment.background.foreground import (
     ForegroundSettings,
-    evidence,
     fill_holes,
     grown,
     moved_pixels,
     nearer_than_scene,
+    pixel_log_odds,
     refine_border,
     smooth,
     window_around,
@@ -60,7 +60,7 @@ class BackgroundSettings:
     part_of_scene: float = 0.9
     """An object less of which stands out from the scene than this was partly learned as scene."""
     unknown: float = 0.02
-    """A component with a larger share of pixels whose scene is unknown is told by its own colours."""
+    """A component with a larger share of pixels whose scene is unknown is judged by its own colours."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,7 +168,7 @@ def follow(
         return Found(np.zeros_like(rough), 0.0, others_px, False)
     wide = grown(rough, 5)
     unknown = ~scene.known if beside is None else beside.unknown
-    if not memory.others_near:  # where nothing else is near, depth before the table tells enough
+    if not memory.others_near:  # where nothing else is near, depth before the table suffices
         unknown = unknown & (scene.depth_m == 0)
     strange = (wide & unknown).sum() > s.unknown * rough.sum()
     larger = rough.sum() > s.grown * area
@@ -180,7 +180,7 @@ def follow(
     else:
         least = None if beside is None else s.piece_px
         bare = None if scene.known[wide].all() else np.where(scene.known, 0, memory.likeness.log_odds(frame.color_rgb))
-        # where the scene's colour is known, it tells; the robot's colours speak against the object only
+        # where the scene's colour is known, it decides; the robot's colours speak against the object only
         odds = bare if beside is None else np.where(scene.known, np.minimum(beside.odds, 0), beside.odds)
         mask, sure = refine_border(frame, scene, rough, odds, s.foreground, least)
     if block is not None:
@@ -230,8 +230,8 @@ def _is_all_object(
     """Whether what has grown on the object is its own, as of a box that turns its broad side.
 
     It does not reach far, in the image (more where it moves by `way_px` between the exposures, which an impact changes)
-    or in depth, and nothing else was near that could have touched it. Its colours say nothing: a box that spins shows a
-    side in this frame that it never showed before.
+    or in depth, and nothing else was near that could have touched it. Its colours do not count: a box that spins shows
+    a side in this frame that it never showed before.
     """
     added = rough & ~expected
     reach = cv2.distanceTransform((~expected).astype(np.uint8), cv2.DIST_L2, 3)[added]
@@ -286,7 +286,7 @@ def _among_others(
     at = window_around(expected, 30)
     if at is None:
         return np.zeros_like(expected)
-    not_scene = np.minimum(evidence(frame, scene, expected, at, None, s.foreground), 1.0)
+    not_scene = np.minimum(pixel_log_odds(frame, scene, expected, at, None, s.foreground), 1.0)
     inward = cv2.distanceTransform(expected[at].astype(np.uint8), cv2.DIST_L2, 3)
     outward = cv2.distanceTransform((~expected[at]).astype(np.uint8), cv2.DIST_L2, 3)
     place = np.clip((inward - outward) / 5.0, -3.0, 1.5)

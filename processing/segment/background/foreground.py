@@ -9,7 +9,8 @@ import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 from numpy import ndarray as Array
 
-from processing.segment.background.static_scene import StaticScene, stereo_sigma_m
+from processing.segment.background.static_scene import StaticScene
+from processing.sensor.noise import stereo_sigma_m
 from recordings.records import RgbdFrame
 
 Window = tuple[slice, slice]
@@ -17,7 +18,7 @@ Window = tuple[slice, slice]
 
 @dataclass(frozen=True)
 class ForegroundSettings:
-    """Thresholds and weights of a pixel's evidence (log-odds); colour values are 0..255."""
+    """Thresholds and weights of a pixel's log-odds; colour values are 0..255."""
 
     nearer_m: float = 0.008
     """The least distance in front of the scene that counts (more where depth is noisy)."""
@@ -30,7 +31,8 @@ class ForegroundSettings:
     weight_color: float = 2.0
     weight_scene_color: float = 1.5
     contrast: float = 2.0
-    """An object that differs from the scene by so many times the least step is told from it by colour in full."""
+    """An object that differs from the scene by so many times the least step is distinguished from it by colour in
+    full."""
     least_contrast: float = 0.15
     weight_nearer: float = 1.5
     weight_scene_depth: float = 1.5
@@ -78,10 +80,10 @@ def nearer_than_scene(depth_m: Float32[Array, "h w"], scene: StaticScene, s: For
 def moved_pixels(frame: RgbdFrame, scene: StaticScene, s: ForegroundSettings) -> Bool[Array, "h w"]:
     """Pixels that are not the scene: nearer, or of another colour where there is no depth. Specks are removed."""
     nearer = nearer_than_scene(frame.depth_m, scene, s)
-    told_by_color = scene.known & (frame.depth_m == 0)
-    apart = np.abs(frame.color_rgb[told_by_color] - scene.color_rgb[told_by_color])
+    color_only = scene.known & (frame.depth_m == 0)
+    apart = np.abs(frame.color_rgb[color_only] - scene.color_rgb[color_only])
     difference = np.maximum(np.maximum(apart[:, 0], apart[:, 1]), apart[:, 2])  # much faster than .max(-1)
-    nearer[told_by_color] |= difference > np.maximum(s.color_step, 4 * scene.color_sigma[told_by_color])
+    nearer[color_only] |= difference > np.maximum(s.color_step, 4 * scene.color_sigma[color_only])
     found = cv2.morphologyEx(nearer.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     return cv2.morphologyEx(found, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8)) > 0
 
@@ -95,7 +97,7 @@ def shadow_distance(
     return np.linalg.norm(color - shade[..., None] * scene, axis=-1).astype(np.float32)
 
 
-def evidence(
+def pixel_log_odds(
     frame: RgbdFrame,
     scene: StaticScene,
     rough: Bool[Array, "h w"],
@@ -168,7 +170,7 @@ def refine_border(
     if at is None:
         return rough, 0.0
     part = rough[at].astype(np.uint8)
-    odds = evidence(frame, scene, rough, at, None if likeness is None else likeness[at], s)
+    odds = pixel_log_odds(frame, scene, rough, at, None if likeness is None else likeness[at], s)
     odds[cv2.erode(part, kernel(s.band_inside_px)) > 0] = 8.0
     odds[cv2.dilate(part, kernel(s.band_outside_px)) == 0] = -8.0
     belief = smooth(odds, frame.color_rgb[at].astype(np.float32), s)

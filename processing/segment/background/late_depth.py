@@ -16,26 +16,26 @@ from recordings.records import RgbdFrame
 
 @dataclass(frozen=True)
 class LateDepthSettings:
-    """When depth is moved, how far around the foretold place colour is asked, and what moved depth tells then."""
+    """When depth is moved, how far around the predicted place colour is asked, and what moved depth is worth then."""
 
     least_px: float = 1.0
     """A smaller way between the exposures is left to the border's refinement."""
     search_px: int = 3
     search_share: float = 0.6
-    """The way is sought within so many pixels, and this share of it, around the foretold one."""
+    """The way is sought within so many pixels, and this share of it, around the predicted one."""
     color_step: float = 20.0
     """The least difference of colour from the scene that counts."""
     shadow: float = 0.3
     """What may be the scene in a shadow counts so much: the object's own shadow lies beside it and is no part of it."""
     pull: float = 0.002
-    """Share of the object's pixels that a pixel off the foretold way must win."""
+    """Share of the object's pixels that a pixel off the predicted way must win."""
     border_depth: float = 0.25
     border_px: int = 4
     """Moved depth counts so much less at the border, which is drawn anew so far to either side of it: the object has
     turned, too."""
 
     def at_border(self, s: ForegroundSettings) -> ForegroundSettings:
-        """How a pixel's evidence is weighed where depth was moved."""
+        """How a pixel's log-odds are weighed where depth was moved."""
         return replace(
             s,
             weight_nearer=self.border_depth * s.weight_nearer,
@@ -54,15 +54,15 @@ def at_color_time(
     frame: RgbdFrame,
     scene: StaticScene,
     body: Bool[Array, "h w"],
-    foretold_px: Float[Array, "2"],
+    predicted_px: Float[Array, "2"],
     s: LateDepthSettings,
     look: ForegroundSettings,
 ) -> RgbdFrame:
-    """The frame with the depth of `body` (its pixels in the depth image) moved by the whole pixels, near `foretold_px`,
-    after which it covers most of what does not look like the scene; behind it the scene's depth."""
-    reach = s.search_px + int(np.ceil(s.search_share * float(np.linalg.norm(foretold_px))))
-    middle = np.round(foretold_px).astype(int)
-    at = window_around(body, int(np.abs(middle).max()) + reach + 1)
+    """The frame with the depth of `body` (its pixels in the depth image) moved by the whole pixels, near
+    `predicted_px`, after which it covers most of what does not look like the scene; behind it the scene's depth."""
+    reach = s.search_px + int(np.ceil(s.search_share * float(np.linalg.norm(predicted_px))))
+    center_px = np.round(predicted_px).astype(int)
+    at = window_around(body, int(np.abs(center_px).max()) + reach + 1)
     if at is None:
         return frame
     part = window_around(body, 0)
@@ -74,11 +74,11 @@ def at_color_time(
     scores = cv2.matchTemplate(strange, template, cv2.TM_CCORR) / template.sum()
     best, chosen = -np.inf, None
     for dx, dy in steps:
-        y, x = top + middle[1] + dy, left + middle[0] + dx
+        y, x = top + center_px[1] + dy, left + center_px[0] + dx
         if 0 <= y < scores.shape[0] and 0 <= x < scores.shape[1]:
             score = float(scores[y, x]) - s.pull * float(np.hypot(dx, dy))
             if score > best:
-                best, chosen = score, (middle[0] + dx, middle[1] + dy)
+                best, chosen = score, (center_px[0] + dx, center_px[1] + dy)
     return frame if chosen is None else _moved(frame, scene, body, (int(chosen[0]), int(chosen[1])))
 
 

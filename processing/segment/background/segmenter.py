@@ -28,14 +28,14 @@ from processing.segment.background.static_scene import (
     StaticScene,
     colorless,
     leveled,
-    stereo_sigma_m,
     surroundings,
     with_object_removed,
 )
 from processing.segment.detect.candidates import Finder
-from processing.segment.detect.detection import FindSettings, Sighting, courses_of, look_of, sightings
+from processing.segment.detect.detection import Detection, FindSettings, appearance_of, detections, tracklets_of
 from processing.segment.robot.frames import RobotFrames, robot_likeness, with_robot
 from processing.segment.segmenter import Example, FrameMask
+from processing.sensor.noise import stereo_sigma_m
 from recordings.errors import BadInput
 from recordings.geometry import CameraModel
 from recordings.progress import Progress
@@ -63,20 +63,20 @@ class BackgroundSegmenter:
         camera: CameraModel | None,
         settings: BackgroundSettings,
         drawn: RobotFrames | None = None,
-        sighting: Sighting | None = None,
+        detection: Detection | None = None,
         gravity: Float[Array, "3"] | None = None,
         find: FindSettings | None = None,
     ) -> None:
-        """`drawn`: the robot in every frame of the toss, where it is known; it says more than its pixels alone.
-        `sighting`: where the toss shows the object, used where no mask is given; without it the object is looked for
+        """`drawn`: the robot in every frame of the toss, where it is known; it holds more than its pixels alone.
+        `detection`: where the toss shows the object, used where no mask is given; without it the object is looked for
         in the toss alone. `gravity`: its direction in the camera frame, where that is known."""
         self._scene = scene
         self._camera = camera
         self._settings = settings
         self._drawn = drawn
-        self._sighting, self._gravity, self._find_settings = sighting, gravity, find or FindSettings()
+        self._detection, self._gravity, self._find_settings = detection, gravity, find or FindSettings()
         self.counts = {"badly_exposed": 0, "others_moving": 0}
-        """Frames whose colours say nothing, and frames in which something else of the object's size moves."""
+        """Frames whose colours are of no use, and frames in which something else of the object's size moves."""
 
     def masks(
         self,
@@ -89,16 +89,16 @@ class BackgroundSegmenter:
         """Yield a mask for every frame: the clearest known one, then those after it, then those before it; at last
         those that the object came back in."""
         given = {i: _checked(m, i, frames[0].depth_m.shape) for i, m in given.items() if i < len(frames)}
-        sighting = None if given else self._sighting or self._find(frames, example)
-        if sighting is None:
+        detection = None if given else self._detection or self._find(frames, example)
+        if detection is None:
             start = min(given)
             seed = Found(given[start], 1.0)
             self._refuse_scene(self._leveled(frames[start])[0], seed.mask, start)
         else:
-            start = sighting.start
-            seed = self._outlined(frames[start], start, sighting.masks[start], robot)
+            start = detection.start
+            seed = self._outlined(frames[start], start, detection.masks[start], robot)
         yield FrameMask(start, seed.mask, seed.confidence)
-        mine = set(range(len(frames))) if sighting is None else sighting.belongs_to(start, len(frames))
+        mine = set(range(len(frames))) if detection is None else detection.belongs_to(start, len(frames))
         empty = {i: FrameMask(i, np.zeros_like(seed.mask), 0.0) for i in range(len(frames)) if i not in mine}
         done = 1
         for i, found, lit in self._both_ways(frames, start, seed, given, robot, mine - {start}):
@@ -106,12 +106,12 @@ class BackgroundSegmenter:
             done += 1
             progress.step(done, len(frames), "masks")
             mask = FrameMask(i, found.mask, found.confidence)
-            if found.mask.any() or sighting is None:
+            if found.mask.any() or detection is None:
                 yield mask
             else:
                 empty[i] = mask
-        for i in () if sighting is None else sighting.again:
-            for k, found in self._seen_again(frames, i, sighting, robot, set(empty)) if sighting else ():
+        for i in () if detection is None else detection.again:
+            for k, found in self._redetected(frames, i, detection, robot, set(empty)) if detection else ():
                 del empty[k]
                 yield FrameMask(k, found.mask, found.confidence)
         yield from empty.values()
@@ -131,8 +131,8 @@ class BackgroundSegmenter:
         scene = self._scene_without(first, seed.mask)
         for order in (range(start + 1, len(frames)), range(start - 1, -1, -1)):
             memory = replace(remember(None, first, seed), others_near=self._held(first, scene, seed.mask))
-            if self._sighting is not None:
-                memory = replace(memory, likeness=memory.likeness.with_shares(self._sighting.shares))
+            if self._detection is not None:
+                memory = replace(memory, likeness=memory.likeness.with_shares(self._detection.shares))
             for i in order:
                 if i not in within:
                     break
@@ -148,28 +148,28 @@ class BackgroundSegmenter:
         around = grown(mask, reach_px(int(mask.sum()), 1)) & ~grown(mask, 3)
         return self._drawn is None and int((moved_pixels(frame, scene, s.foreground) & around).sum()) > 3 * s.least_px
 
-    def _seen_again(
+    def _redetected(
         self,
         frames: Sequence[RgbdFrame],
         start: int,
-        sighting: Sighting,
+        detection: Detection,
         robot: Sequence[Bool[Array, "h w"]] | None,
         empty: set[int],
     ) -> Iterator[tuple[int, Found]]:
         """The object where it is seen in frames in which following did not find it."""
         if start not in empty:
             return
-        seed = self._outlined(frames[start], start, sighting.masks[start], robot)
+        seed = self._outlined(frames[start], start, detection.masks[start], robot)
         if not seed.mask.any():
             return
-        empty = empty & sighting.belongs_to(start, len(frames))
+        empty = empty & detection.belongs_to(start, len(frames))
         yield start, seed
         for i, found, _ in self._both_ways(frames, start, seed, {}, robot, empty - {start}):
             if found.mask.any():
                 yield i, found
 
     def _leveled(self, frame: RgbdFrame) -> tuple[RgbdFrame, bool]:
-        """The frame as bright as the scene, and whether its colours can be believed at all."""
+        """The frame as bright as the scene, and whether its colours are accepted at all."""
         s = self._settings
         return leveled(frame, self._scene, s.darkest, s.most_clipped, s.least_gain)
 
@@ -216,7 +216,7 @@ class BackgroundSegmenter:
     def _scene_without(self, frame: RgbdFrame, mask: Bool[Array, "h w"]) -> StaticScene:
         moved = moved_pixels(frame, self._scene, self._settings.foreground)
         stands_out = (moved & mask).sum() >= self._settings.part_of_scene * mask.sum()
-        # before the table, depth tells what the scene's unknown colour cannot
+        # before the table, depth decides what the scene's unknown colour cannot
         unknown = (~self._scene.known & (self._scene.depth_m == 0) & surroundings(mask)).sum()
         # with a robot the scene is learned behind what it holds: what is unknown there lies behind the robot itself
         if stands_out and (self._drawn is not None or unknown <= self._settings.unknown * mask.sum()):
@@ -244,19 +244,19 @@ class BackgroundSegmenter:
         mask, sure = refine_border(frame, scene, component_in(moved, rough), None, s.foreground)
         return Found(mask, sure)
 
-    def _find(self, frames: Sequence[RgbdFrame], example: Example | None) -> Sighting:
+    def _find(self, frames: Sequence[RgbdFrame], example: Example | None) -> Detection:
         """The object in this toss alone."""
         if self._camera is None:
             raise BadInput("no mask of the object was given, and the camera's intrinsics are not known")
         finder = Finder(self._scene, self._camera, self._find_settings.things)
         drawn = None if self._drawn is None else self._drawn.coarser(finder.stride)
-        courses = courses_of(finder, frames, drawn, self._gravity, self._find_settings)
-        known = None if example is None else look_of(example, self._camera)
+        tracklets = tracklets_of(finder, frames, drawn, self._gravity, self._find_settings)
+        known = None if example is None else appearance_of(example, self._camera)
         shape = frames[0].depth_m.shape
-        found = sightings({0: courses}, known, shape, finder.stride, self._find_settings)
+        found = detections({0: tracklets}, known, shape, finder.stride, self._find_settings)
         if not found:
             raise BadInput(NOT_FOUND)
-        self._sighting = found[0]
+        self._detection = found[0]
         return found[0]
 
 

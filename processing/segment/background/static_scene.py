@@ -11,6 +11,8 @@ from jaxtyping import Bool, Float, Float32
 from numpy import ndarray as Array
 
 from processing.segment.background.moving_camera import refuse_moving_camera
+from processing.sensor.noise import stereo_sigma_m
+from recordings.constants import MAD_TO_SIGMA_SHORT
 from recordings.errors import BadInput
 from recordings.geometry import CameraModel, Transform
 from recordings.records import RgbdFrame
@@ -27,7 +29,7 @@ class SceneSettings:
     """The scene lies at this quantile of the depths seen by a pixel: things in front of it come and go."""
     seen_share: float = 0.4
     """A pixel whose depth agrees with the scene in fewer frames has no scene depth."""
-    table_looks: int = 3
+    table_observations: int = 3
     """What stands in front of the table is not the scene where the table was seen in so many frames."""
     stands_m: float = 0.008
     """What is higher above the table (or 4 standard deviations of depth) stands on it."""
@@ -42,7 +44,7 @@ class SceneSettings:
     no_return_share: float = 0.2
     no_return_color: float = 10.0
     """It is known all the same where it gave none in so many frames and then showed one colour (sigma, 0..255)."""
-    least_looks: int = 2
+    least_observations: int = 2
     """A pixel that was free of the robot in fewer frames is learned as it is: the robot's base never leaves it."""
     robot_margin_px: int = 14
     """Around the robot as calibrated: its place may be off by some millimetres and tenths of a degree."""
@@ -77,11 +79,6 @@ class StaticScene:
         """From a stage's folder."""
         with np.load(folder / "scene.npz", allow_pickle=False) as stored:
             return StaticScene(**stored)
-
-
-def stereo_sigma_m(depth_m: Float32[Array, "*n"]) -> Float32[Array, "*n"]:
-    """Noise of active stereo depth: it grows with the square of the distance (0.08 px of disparity: 2.3 mm at 1 m)."""
-    return np.float32(0.0025) * depth_m * depth_m
 
 
 def sample_positions(counts: Sequence[int], wanted: int) -> list[tuple[int, int]]:
@@ -164,21 +161,21 @@ def _always_covered(
     lift = np.maximum(settings.stands_m, 4 * stereo_sigma_m(table_m))
     stands = (depth_m > 0) & (table_m - depth_m > lift)
     above = (scene_m > 0) & (table_m - scene_m > lift)
-    doubtful = stands & above & (share < settings.always_share)
-    doubtful &= np.abs(depth_m - scene_m) < np.maximum(0.006, 5 * stereo_sigma_m(scene_m))
+    uncertain = stands & above & (share < settings.always_share)
+    uncertain &= np.abs(depth_m - scene_m) < np.maximum(0.006, 5 * stereo_sigma_m(scene_m))
     out = np.zeros_like(stands)
-    if not doubtful.any():
+    if not uncertain.any():
         return out
     arrived = cv2.morphologyEx((stands & (scene_m > 0) & ~above).astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3))) > 0
     _, labels = cv2.connectedComponents(stands.astype(np.uint8), connectivity=4)
-    for k in np.unique(labels[doubtful]):
+    for k in np.unique(labels[uncertain]):
         thing = np.asarray(labels == k)
         came = thing & arrived
         if came.sum() < max(settings.arrived_share * thing.sum(), 1):
             continue
         near, far = np.quantile(depth_m[came], (0.02, 0.98))
         inside = (depth_m > near - settings.object_m) & (depth_m < far + settings.object_m)
-        out |= thing & doubtful & inside
+        out |= thing & uncertain & inside
     solid = cv2.morphologyEx(out.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))  # no flickering edges
     grown = cv2.dilate(solid, np.ones((5, 5), np.uint8)) > 0
     return grown & (above | (scene_m == 0))
@@ -200,30 +197,30 @@ def _learn_rows(
 ) -> tuple[Array, Array, Array, Array, Array, Array]:
     """Scene depth, its noise, colour, its noise, whether known, and the share of returns that were the scene, for some
     rows, from what is not hidden."""
-    never = (~hidden).sum(0) < settings.least_looks
+    never = (~hidden).sum(0) < settings.least_observations
     hidden = hidden & ~never  # what stands there for the whole session is a part of the scene
     z = np.where(hidden, np.float32(0), np.stack(depths))
-    looks = np.maximum((~hidden).sum(0), 1)
+    observations = np.maximum((~hidden).sum(0), 1)
     seen = z > 0
-    without = (~seen & ~hidden).sum(0) / looks
+    without = (~seen & ~hidden).sum(0) / observations
     far = _farthest(z, seen, settings)
     agrees = seen & (np.abs(z - far) < np.maximum(0.006, 5 * stereo_sigma_m(far)))
     near_table_m = np.maximum(0.006, 3 * stereo_sigma_m(table_m))
     on_table = seen & (np.abs(z - table_m) < near_table_m)
     # where the table was seen it is the scene, however long an object stood before it or its shadow hid the depth
-    beneath = (on_table.sum(0) >= settings.table_looks) & (far < table_m + near_table_m)
+    beneath = (on_table.sum(0) >= settings.table_observations) & (far < table_m + near_table_m)
     agrees = np.where(beneath, on_table, agrees)
-    share = agrees.sum(0) / looks
+    share = agrees.sum(0) / observations
     # what stands above the table for a while only may be the object at rest
     seldom = (share > 1 - settings.far_share) & (without < settings.no_return_share) & (far > table_m - near_table_m)
     valid = beneath | (share >= settings.seen_share) | seldom
     depth = _masked_median(z, agrees)
-    sigma = 1.48 * _masked_median(np.abs(z - depth), agrees)
+    sigma = MAD_TO_SIGMA_SHORT * _masked_median(np.abs(z - depth), agrees)
     empty = (agrees | (~seen & ~valid[None])) & ~hidden
     color, color_sigma = _color_median(np.stack(colors), empty)
     depth, sigma = np.where(valid, depth, 0), np.where(valid, sigma, 0)
     empty_alike = ~valid & (without >= settings.no_return_share) & (color_sigma < settings.no_return_color)
-    known = valid | (seen.sum(0) / looks < settings.returns_share) | empty_alike
+    known = valid | (seen.sum(0) / observations < settings.returns_share) | empty_alike
     share = agrees.sum(0) / np.maximum(seen.sum(0), 1)
     return depth.astype(np.float32), sigma.astype(np.float32), color, color_sigma, known, share.astype(np.float32)
 
@@ -241,7 +238,7 @@ def _color_median(colors: Array, empty: Bool[Array, "n h w"]) -> tuple[Float32[A
     use = empty | ~empty.any(0, keepdims=True)
     color = np.stack([_masked_median(colors[..., k].astype(np.float32), use) for k in range(3)], -1)
     spread = np.abs(colors.astype(np.float32) - color).max(-1)
-    return color, (1.48 * _masked_median(spread, use)).astype(np.float32)
+    return color, (MAD_TO_SIGMA_SHORT * _masked_median(spread, use)).astype(np.float32)
 
 
 def _masked_median(values: Array, use: Bool[Array, "n h w"]) -> Float32[Array, "h w"]:
@@ -299,8 +296,8 @@ def fit_plane(
 def seen_table_depth(depths_m: Sequence[Float32[Array, "h w"]], camera: CameraModel) -> Float32[Array, "h w"] | None:
     """Depth of the plane that most of what stood still lies on; None without a clear one."""
     stack = np.stack([d[::8, ::8] for d in depths_m])
-    middle = _masked_median(stack, stack > 0)
-    points = camera.pixel_rays()[::8, ::8][middle > 0] * middle[middle > 0][:, None].astype(np.float64)
+    median_m = _masked_median(stack, stack > 0)
+    points = camera.pixel_rays()[::8, ::8][median_m > 0] * median_m[median_m > 0][:, None].astype(np.float64)
     plane = fit_plane(points, 0.008)
     return None if plane is None else plane_depth(camera, *plane)
 
@@ -356,7 +353,7 @@ def _brightest(color: Array) -> Array:
 def leveled(
     frame: RgbdFrame, scene: StaticScene, darkest: float = 0.12, most_clipped: float = 0.5, least_gain: float = 0.02
 ) -> tuple[RgbdFrame, bool]:
-    """The frame as bright as the scene, and whether its colours can be believed at all.
+    """The frame as bright as the scene, and whether its colours are accepted at all.
 
     They cannot in a frame `darkest` times as bright as the scene, in one brighter by the inverse, and where more than
     `most_clipped` of the scene is overexposed. A gain within `least_gain` of 1 is left as it is.
@@ -371,7 +368,7 @@ def leveled(
 
 
 def colorless(scene: StaticScene) -> StaticScene:
-    """The scene for a frame whose colours say nothing: only its depth is known."""
+    """The scene for a frame whose colours are of no use: only its depth is known."""
     return replace(scene, color_sigma=np.full_like(scene.color_sigma, 1e4))
 
 

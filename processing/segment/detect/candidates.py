@@ -1,6 +1,6 @@
 """What stands out from the static scene in one frame: each thing a candidate for the object.
 
-Frames are looked at coarsely (every n-th pixel): finding needs no exact outline.
+Frames are searched coarsely (every n-th pixel): finding needs no exact outline.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ class CandidateSettings:
 
     foreground: ForegroundSettings = field(default_factory=ForegroundSettings)
     widest_px: int = 330
-    """Frames are looked at no wider than this."""
+    """Frames are searched no wider than this."""
     least_px: int = 30
     """A smaller thing (coarse pixels) is noise."""
     largest_share: float = 0.2
     """A thing that covers more of the image is no tossed object."""
     most: int = 8
-    """Only so many of the largest things of a frame are looked at."""
+    """Only so many of the largest things of a frame are considered."""
     least_depth: float = 0.3
     """Share of a thing's pixels with depth."""
     near_px: int = 2
@@ -134,11 +134,11 @@ class Finder:
         use = mask & (depth > 0)
         if use.sum() < self.settings.least_depth * mask.sum():
             return None
-        middle = float(np.median(depth[use]))
-        use &= np.abs(depth - middle) < 0.3
+        median_m = float(np.median(depth[use]))
+        use &= np.abs(depth - median_m) < 0.3
         center = (self._rays[at][use] * depth[use][:, None]).mean(0).astype(np.float64)
-        size = float(np.sqrt(mask.sum())) * self._pixel_m * middle
-        free, on_robot = self._free(labels, number, at, np.abs(drawn_m - middle) < self.settings.robot_near_m)
+        size = float(np.sqrt(mask.sum())) * self._pixel_m * median_m
+        free, on_robot = self._free(labels, number, at, np.abs(drawn_m - median_m) < self.settings.robot_near_m)
         shares = color_shares(
             frame.color_rgb[at], cv2.erode(np.pad(mask, 1).astype(np.uint8), kernel(1))[1:-1, 1:-1] > 0
         )

@@ -1,4 +1,4 @@
-"""Where a toss shows the object most clearly, and the same for every toss of a session, without any given mask."""
+"""Detection of the object without any given mask: where each toss of a session shows it most clearly."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from numpy import ndarray as Array
 
 from processing.segment.background.color_model import color_shares
 from processing.segment.detect.candidates import Candidate, CandidateSettings, Finder
-from processing.segment.detect.tracklets import Course, CourseSettings, Look, alike, choose, join
+from processing.segment.detect.tracklets import Appearance, Tracklet, TrackletSettings, alike, choose, join
 from processing.segment.robot.frames import CoarseFrames, RobotFrames
 from processing.segment.segmenter import Example
 from recordings.geometry import CameraModel
@@ -27,13 +27,13 @@ class FindSettings:
     """How the object is found where no mask of it was given."""
 
     things: CandidateSettings = field(default_factory=CandidateSettings)
-    courses: CourseSettings = field(default_factory=CourseSettings)
+    tracklets: TrackletSettings = field(default_factory=TrackletSettings)
     every_s: float = 0.06
-    """Frames are looked at so far apart, and at each toss's first and last."""
+    """Frames are searched so far apart, and at each toss's first and last."""
     may_fall: float = 0.15
-    """A course that falls so clearly is looked at in every frame of its fall."""
+    """A tracklet that falls so clearly is searched in every frame of its fall."""
     again: float = 0.3
-    """Another course looks so much like the object (-1..1) that it is the object, seen before or after a gap."""
+    """Another tracklet is so much like the object (-1..1) that it is a re-detection of it, before or after a gap."""
     jump_m: float = 0.15
     jump_m_s2: float = 15.0
     """No motion leads over a gap that is wider than this, after the velocities on both sides are taken out, and needs
@@ -41,10 +41,10 @@ class FindSettings:
 
 
 @dataclass(frozen=True, eq=False)
-class Sighting:
+class Detection:
     """The object in one toss: rough masks (blocks of some pixels) by position of the frame. `start` is the clearest;
-    the others are places where it is seen again after it was away. `spans`: the first and the last frame of the course
-    that each belongs to. `shares`: of its colours, over all tosses."""
+    the others are re-detections after it was away. `spans`: the first and the last frame of the tracklet that
+    each belongs to. `shares`: of its colours, over all tosses."""
 
     start: int
     masks: Mapping[int, Bool[Array, "h w"]]
@@ -60,35 +60,35 @@ class Sighting:
         return [i for i in sorted(self.masks) if i != self.start]
 
     def belongs_to(self, start: int, count: int) -> set[int]:
-        """The frames, of so many, that no other course than that of `start` covers."""
+        """The frames, of so many, that no other tracklet than that of `start` covers."""
         others = [span for i, span in self.spans.items() if i != start] + list(self.elsewhere)
         return set(range(count)) - {i for first, last in others for i in range(first, last + 1)}
 
 
-def courses_of(
+def tracklets_of(
     finder: Finder,
     frames: Sequence[RgbdFrame],
     robot: RobotFrames | None,
     gravity: Float[Array, "3"] | None,
     settings: FindSettings,
     progress: Callable[[int, int], None] = lambda done, total: None,
-) -> list[Course]:
+) -> list[Tracklet]:
     """Everything that moves through a toss. `robot`: drawn for coarse frames."""
     coarse = CoarseFrames(frames, finder.stride)
     things: dict[int, list[Candidate]] = {}
 
-    def look(at: Sequence[int]) -> list[list[Candidate]]:
+    def things_at(at: Sequence[int]) -> list[list[Candidate]]:
         for i in at:
             things[i] = finder.things(coarse[i], i, robot)
             progress(len(things), max(len(frames), 1))
         return [things[i] for i in sorted(things)]
 
-    courses = join(look(positions(frames, settings.every_s)), gravity, settings.courses)
-    falling = [c.fall_span for c in courses if c.fall > settings.may_fall]
+    tracklets = join(things_at(positions(frames, settings.every_s)), gravity, settings.tracklets)
+    falling = [c.fall_span for c in tracklets if c.fall > settings.may_fall]
     between = {i for first, last in falling for i in range(first, last) if i not in things}
-    # what seemed to fall is looked at in every frame: noise does not stay on its parabola
+    # what seemed to fall is searched in every frame: noise does not stay on its parabola
     gap_s = 2.5 * _period_s(frames)
-    return join(look(sorted(between)), gravity, settings.courses, gap_s)
+    return join(things_at(sorted(between)), gravity, settings.tracklets, gap_s)
 
 
 def _period_s(frames: Sequence[RgbdFrame]) -> float:
@@ -106,54 +106,62 @@ def positions(frames: Sequence[RgbdFrame], every_s: float) -> list[int]:
     return sorted({*range(0, len(frames), step), len(frames) - 1})
 
 
-def sightings(
-    courses: Mapping[int, Sequence[Course]], known: Look | None, shape: tuple[int, ...], stride: int, s: FindSettings
-) -> dict[int, Sighting]:
-    """The object in every toss in which it is found. `known`: what it looks like, where a mask of it was given."""
-    chosen = choose(courses, known, s.courses)
+def detections(
+    tracklets: Mapping[int, Sequence[Tracklet]],
+    known: Appearance | None,
+    shape: tuple[int, ...],
+    stride: int,
+    s: FindSettings,
+) -> dict[int, Detection]:
+    """The object in every toss in which it is found. `known`: its appearance, where a mask of it was given."""
+    chosen = choose(tracklets, known, s.tracklets)
     if not chosen:
         return {}
     shares = np.asarray(np.mean([c.shares for c, _ in chosen.values()], axis=0))
-    look = Look(shares if known is None else known.shares, float(np.median([c.size_m for c, _ in chosen.values()])))
+    appearance = Appearance(
+        shares if known is None else known.shares, float(np.median([c.size_m for c, _ in chosen.values()]))
+    )
     found = {}
-    for toss, (course, score) in chosen.items():
-        first = clearest(course)
-        others = [c for c in courses[toss] if c is not course and apart(c, course) and alike(c, look) > s.again]
-        seen = {clearest(c).position: c for c in others} | {first.position: course}
-        jumped = [c for c in seen.values() if c is not course and not leads_to(course, c, s)]
+    for toss, (tracklet, score) in chosen.items():
+        first = clearest(tracklet)
+        others = [
+            c for c in tracklets[toss] if c is not tracklet and apart(c, tracklet) and alike(c, appearance) > s.again
+        ]
+        seen = {clearest(c).position: c for c in others} | {first.position: tracklet}
+        jumped = [c for c in seen.values() if c is not tracklet and not leads_to(tracklet, c, s)]
         seen = {i: c for i, c in seen.items() if c not in jumped}
-        elsewhere = tuple(_up_to(c, course) for c in jumped)
+        elsewhere = tuple(_up_to(c, tracklet) for c in jumped)
         masks = {i: clearest(c).picture(shape, stride) for i, c in seen.items()}
         spans = {i: _span(c) for i, c in seen.items()}
-        found[toss] = Sighting(first.position, masks, spans, look.shares, score, elsewhere)
+        found[toss] = Detection(first.position, masks, spans, appearance.shares, score, elsewhere)
     return found
 
 
-def look_of(example: Example, camera: CameraModel) -> Look:
-    """What a frame with a given mask tells of the object."""
+def appearance_of(example: Example, camera: CameraModel) -> Appearance:
+    """The object's appearance in a frame with a given mask."""
     depth = example.frame.depth_m[example.mask & (example.frame.depth_m > 0)]
-    middle = float(np.median(depth)) if len(depth) else 1.0
-    size = float(np.sqrt(example.mask.sum())) * middle / float(camera.fx)
-    return Look(color_shares(example.frame.color_rgb, example.mask), size)
+    median_m = float(np.median(depth)) if len(depth) else 1.0
+    size = float(np.sqrt(example.mask.sum())) * median_m / float(camera.fx)
+    return Appearance(color_shares(example.frame.color_rgb, example.mask), size)
 
 
-def _span(course: Course) -> tuple[int, int]:
-    return course.seen[0].position, course.seen[-1].position
+def _span(tracklet: Tracklet) -> tuple[int, int]:
+    return tracklet.seen[0].position, tracklet.seen[-1].position
 
 
-def _up_to(away: Course, course: Course) -> tuple[int, int]:
-    """The frames of a course and those between it and another: the object jumped in one of them."""
-    (first, last), (begins, ends) = _span(away), _span(course)
+def _up_to(away: Tracklet, tracklet: Tracklet) -> tuple[int, int]:
+    """The frames of a tracklet and those between it and another: the object jumped in one of them."""
+    (first, last), (begins, ends) = _span(away), _span(tracklet)
     return (first, begins - 1) if last < begins else (ends + 1, last)
 
 
-def apart(a: Course, b: Course) -> bool:
-    """Whether two courses share no time."""
+def apart(a: Tracklet, b: Tracklet) -> bool:
+    """Whether two tracklets share no time."""
     return a.seen[-1].position < b.seen[0].position or b.seen[-1].position < a.seen[0].position
 
 
-def leads_to(a: Course, b: Course, s: FindSettings) -> bool:
-    """Whether some motion connects two courses: an object does not jump."""
+def leads_to(a: Tracklet, b: Tracklet, s: FindSettings) -> bool:
+    """Whether some motion connects two tracklets: an object does not jump."""
     first, second = (a, b) if a.seen[0].position < b.seen[0].position else (b, a)
     last, next_ = first.seen[-1], second.seen[0]
     passed_s = next_.time_s - last.time_s
@@ -167,42 +175,42 @@ def _velocity(seen: Sequence[Candidate]) -> Float[Array, "3"]:
     return (seen[-1].center_m - seen[0].center_m) / passed_s if passed_s > 0 else np.zeros(3)
 
 
-def clearest(course: Course) -> Candidate:
+def clearest(tracklet: Tracklet) -> Candidate:
     """The frame in which the object stands most freely, as large as elsewhere, and hardly moves in the picture."""
-    sizes = np.array([c.size_m for c in course.seen])
+    sizes = np.array([c.size_m for c in tracklet.seen])
     usual = float(np.quantile(sizes, 0.6))
-    areas = np.array([c.area_px for c in course.seen], dtype=float)
-    places = np.array([c.center_m for c in course.seen])
+    areas = np.array([c.area_px for c in tracklet.seen], dtype=float)
+    places = np.array([c.center_m for c in tracklet.seen])
     step = np.linalg.norm(np.gradient(places, axis=0), axis=1) if len(places) > 1 else np.zeros(len(places))
     whole = np.exp(-2 * np.abs(np.log(np.maximum(sizes, 1e-6) / usual)))
-    free = np.array([c.free for c in course.seen])
+    free = np.array([c.free for c in tracklet.seen])
     score = free * whole * (0.5 + 0.5 * areas / areas.max()) / (1 + step / 0.05)
-    return course.seen[int(score.argmax())]
+    return tracklet.seen[int(score.argmax())]
 
 
-def write_sightings(folder: Path, found: Mapping[int, Sighting]) -> None:
+def write_detections(folder: Path, found: Mapping[int, Detection]) -> None:
     """Into a stage's folder: sightings.json, and the rough masks as toss_XX/<position>.png (0 or 255)."""
     document: dict[str, Any] = {}
-    for toss, sighting in found.items():
-        spans = {str(i): list(span) for i, span in sighting.spans.items()}
-        document[str(toss)] = {"start": sighting.start, "score": round(sighting.score, 3), "spans": spans}
-        document[str(toss)]["elsewhere"] = [list(span) for span in sighting.elsewhere]
+    for toss, detection in found.items():
+        spans = {str(i): list(span) for i, span in detection.spans.items()}
+        document[str(toss)] = {"start": detection.start, "score": round(detection.score, 3), "spans": spans}
+        document[str(toss)]["elsewhere"] = [list(span) for span in detection.elsewhere]
         (folder / f"toss_{toss:02d}").mkdir()
-        for position, mask in sighting.masks.items():
+        for position, mask in detection.masks.items():
             cv2.imwrite(str(folder / f"toss_{toss:02d}" / f"{position:06d}.png"), mask.astype(np.uint8) * 255)
     (folder / "sightings.json").write_text(json.dumps(document, indent=1) + "\n")
     if found:
         np.save(folder / "shares.npy", next(iter(found.values())).shares)
 
 
-def read_sighting(folder: Path, toss: int) -> Sighting | None:
+def read_detection(folder: Path, toss: int) -> Detection | None:
     """One toss's, from a stage's folder; None where the object was not found in it."""
-    told = json.loads((folder / "sightings.json").read_text()).get(str(toss))
-    if told is None:
+    entry = json.loads((folder / "sightings.json").read_text()).get(str(toss))
+    if entry is None:
         return None
     files = sorted((folder / f"toss_{toss:02d}").glob("*.png"))
     masks = {int(f.stem): np.asarray(np.asarray(cv2.imread(str(f), cv2.IMREAD_GRAYSCALE)) > 0) for f in files}
     shares = np.load(folder / "shares.npy", allow_pickle=False)
-    spans = {int(i): (int(first), int(last)) for i, (first, last) in told["spans"].items()}
-    elsewhere = tuple((int(first), int(last)) for first, last in told["elsewhere"])
-    return Sighting(int(told["start"]), masks, spans, shares, float(told["score"]), elsewhere)
+    spans = {int(i): (int(first), int(last)) for i, (first, last) in entry["spans"].items()}
+    elsewhere = tuple((int(first), int(last)) for first, last in entry["elsewhere"])
+    return Detection(int(entry["start"]), masks, spans, shares, float(entry["score"]), elsewhere)

@@ -18,11 +18,14 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32
 from numpy import ndarray as Array
 
-from processing.segment.background.static_scene import StaticScene, stereo_sigma_m
+from processing.segment.background.static_scene import StaticScene
 from processing.segment.robot.render import RobotView
+from processing.sensor import noise
+from processing.sensor.noise import stereo_sigma_m
 from recordings.geometry import CameraModel, Transform, rotation_exp, rotation_log
 from recordings.records import RgbdFrame
 from recordings.robot.arm import ArmPath
+from recordings.robust import huber_weight
 
 DELAY, SCALE = 6, 7
 FINGERS = ("panda_leftfinger", "panda_rightfinger")
@@ -55,8 +58,7 @@ class RobotFitSettings:
     prior_deg: float = 2.0
     prior_delay_s: float = 0.03
     prior_scale: float = 0.02
-    correlated: float = 6.0
-    """Standard deviations are larger than independent residuals would make them, by this factor."""
+    correlated: float = noise.ROBOT_SIGMA_SCALE
     least_samples: int = 400
     """With fewer depth residuals the robot is hardly in view: nothing is fitted."""
     farthest_m: float = 0.06
@@ -78,7 +80,8 @@ class RobotFit:
     """`camera_from_base` and `delay_s` as refined; `depth_scale` is reported / true depth.
 
     `sigma`: standard deviations of rotation (rad, 3), translation (m, 3), delay (s), scale. The medians are of absolute
-    residuals, before and after. `refused` says why the calibration was left as it is; None where it was refined.
+    residuals, before and after. `refused` gives the reason why the calibration was left as it is; None where it was
+    refined.
     """
 
     camera_from_base: Transform
@@ -329,7 +332,7 @@ def edge_offsets(
     """How far outside of each outline point the image's edge lies (px); NaN where no clear step is found.
 
     Along the normal the difference from the scene falls from the robot's level to that of the scene: the edge lies
-    where it crosses the middle.
+    where it crosses the mean of inside and outside.
     """
     along = np.arange(-reach_px, reach_px + 0.25, 0.5)
     at = pixels[:, None] + outward[:, None] * (along[None, :, None] + 0.5)  # the outline is the rim's outer border
@@ -338,14 +341,14 @@ def edge_offsets(
     seen = cv2.remap(known.astype(np.uint8), x, y, cv2.INTER_NEAREST).all(-1)
     ends = 3
     inside, outside = np.median(profile[:, :ends], 1), np.median(profile[:, -ends:], 1)
-    middle = 0.5 * (inside + outside)
-    above = profile > middle[:, None]
+    threshold = 0.5 * (inside + outside)
+    above = profile > threshold[:, None]
     once = (np.diff(above.astype(int), axis=1) != 0).sum(1) == 1
     k = above.shape[1] - 1 - above[:, ::-1].argmax(1)  # the last sample that is still the robot
     k = np.minimum(k, len(along) - 2)
     rows = np.arange(len(k))
     high, low = profile[rows, k], profile[rows, k + 1]
-    share = (high - middle) / np.maximum(high - low, 1e-3)
+    share = (high - threshold) / np.maximum(high - low, 1e-3)
     clear = seen & once & (inside > s.least_difference) & (outside < 0.4 * inside)
     return np.where(clear, along[k] + 0.5 * np.clip(share, 0, 1), np.nan)
 
@@ -370,7 +373,7 @@ def _solve(
     H, g = np.zeros((8, 8)), np.zeros(8)
     for rows in (depth, outline):
         if len(rows.r):
-            w = np.minimum(1.0, 1.5 / np.maximum(np.abs(rows.r), 1e-9)) / s.correlated**2
+            w = huber_weight(np.abs(rows.r), 1.5) / s.correlated**2
             H += (rows.J * w[:, None]).T @ rows.J
             g += (rows.J * w[:, None]).T @ rows.r
     moved = state.camera_from_base @ start.camera_from_base.inverse()

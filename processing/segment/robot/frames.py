@@ -1,6 +1,6 @@
 """The robot in every frame of a toss, and a frame's scene with the robot standing in it.
 
-Colour and depth are exposed at their own times, so the robot is drawn for each. What its drawing says of a pixel is
+Colour and depth are exposed at their own times, so the robot is drawn for each. What its drawing implies for a pixel is
 weighed against the measured depth: an object in front of the robot, or between its fingers, keeps its pixels.
 """
 
@@ -19,8 +19,9 @@ from numpy import ndarray as Array
 
 from processing.segment.background.color_model import Likeness, color_shares, shares_log_odds
 from processing.segment.background.foreground import grown, kernel
-from processing.segment.background.static_scene import StaticScene, stereo_sigma_m
+from processing.segment.background.static_scene import StaticScene
 from processing.segment.robot.render import RobotView
+from processing.sensor.noise import stereo_sigma_m
 from recordings.geometry import Transform
 from recordings.records import RgbdFrame
 from recordings.robot.arm import PANDA_TOOL, ArmPath
@@ -39,7 +40,7 @@ class RobotSettings:
     rim_px: int = 3
     """A stereo camera fattens edges by so much: robot depth this far outside of the drawn outline is the robot's."""
     near_px: int = 6
-    """So near to the drawn robot, the object's colours are told from the robot's."""
+    """So near to the drawn robot, the object's colours are distinguished from the robot's."""
     agrees_m: float = 0.010
     """Measured depth this near to the drawn one (or 4 standard deviations) is the robot."""
     looks: int = 5

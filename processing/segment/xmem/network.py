@@ -34,7 +34,7 @@ class Widths:
 
 @dataclass(frozen=True, eq=False)
 class Encoded:
-    """What the key encoder says of one image."""
+    """The key encoder's output for one image."""
 
     key: Float[Tensor, "1 k h w"]
     shrinkage: Float[Tensor, "1 1 h w"]

@@ -1,8 +1,8 @@
-"""How two sets of views of one body contradict each other where one of them is placed wrongly.
+"""Free-space and silhouette consistency of two sets of views of one body, one of which may be placed wrongly.
 
 Two tosses may show different sides of a body: then no two views see the same surface, and only outlines and free space
-tell how they belong together. So every view is compared with every view of the other side (consistency_kernels.py).
-What the views of one toss contradict each other is taken off: masks and poses are not perfect.
+show how they belong together. So every view is compared with every view of the other side (consistency_kernels.py).
+The inconsistency among the views of one toss is taken off: masks and poses are not perfect.
 """
 
 from __future__ import annotations
@@ -15,19 +15,20 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 from numpy import ndarray as Array
 
-from processing.motion.motion_prior import all_turns
+from processing.motion.rotation_grid import all_turns
+from processing.sensor import view_layout as lay
 from processing.sensor.view import ViewStore
 from processing.track import kernels as k
 from processing.track.beam import Schedule, rows
 from processing.track.joint_refinement import add_pairs
 from processing.track.keyframes import view_directions
 from processing.track.registration import consistency_kernels as c
-from processing.track.registration.keyframe_database import Pool, Sides, far_apart
+from processing.track.registration.keyframe_database import KeyframeDatabase, Sides, far_apart
 from processing.track.registration.proposals import Fit, distinct, stepped
 
 
 @dataclass(frozen=True)
-class ContradictionConfig:
+class ConsistencyConfig:
     """How placements are aligned and judged, and how they are sought all around."""
 
     views: int = 16
@@ -36,13 +37,14 @@ class ContradictionConfig:
     coarse: Schedule = ((1, 4, 0.008, 0.4, 0.012, 0.125), (0, 4, 0.005, 0.3, 0.006, 0.25))
     fine: Schedule = ((0, 6, 0.003, 0.2, 0.004, 0.25), (0, 4, 0.003, 0.2, 0.003, 0.5))
     judged: Schedule = ((0, 1, 0.003, 0.3, 0.002, 1.0),)
-    """The scales at which a placement is judged: so much is a clear contradiction by a third."""
+    """The scales at which a placement is judged: a residual of three scales is a full inconsistency."""
     rim_share: float = 0.25
-    """What a contradicted point of the rim counts, against one of the surface."""
+    """Weight of an inconsistent point of the rim, against one of the surface."""
     joint_share: float = 0.02
-    """What contradictions count in a refinement of all poses, against pairs that see the same side, which err less."""
+    """Weight of the consistency terms in a refinement of all poses, against pairs that see the same side, which err
+    less."""
     turns: int = 216
-    """Turns tried all around ..."""
+    """Rotations tried all around ..."""
     seek_views: int = 5
     """... with so many views of each side; ..."""
     tried: int = 12
@@ -82,22 +84,22 @@ class Rims:
 
 def _rim(store: ViewStore, i: int) -> Float[Array, "m 3"]:
     """Points on the rays of one view's outline pixels, at the depth of the nearest smooth surface's plane."""
-    row, optics = store.table[i], store.optics
-    h, w = int(row[k.HEIGHT]), int(row[k.WIDTH])
-    if row[k.COUNT] == 0:
+    row, rectified = store.table[i], store.rectified
+    h, w = int(row[lay.HEIGHT]), int(row[lay.WIDTH])
+    if row[lay.COUNT] == 0:
         return np.zeros((0, 3))
-    pixels = store.maps[row[k.OFFSET] : row[k.OFFSET] + w * h].reshape(h, w, k.CHANNELS)
-    seen = pixels[..., k.Z] > 0
+    pixels = store.maps[row[lay.OFFSET] : row[lay.OFFSET] + w * h].reshape(h, w, lay.CHANNELS)
+    seen = pixels[..., lay.Z] > 0
     reach, label = cv2.distanceTransformWithLabels((~seen).astype(np.uint8), cv2.DIST_L2, 5,
                                                    labelType=cv2.DIST_LABEL_PIXEL)  # fmt: skip
     source = np.zeros(int(label.max()) + 1, dtype=np.int64)
     source[label[seen]] = np.flatnonzero(seen)
-    at = np.flatnonzero((_outline(pixels[..., k.OUTSIDE]) & (reach < RIM_REACH_PX)).ravel())
-    plane = pixels.reshape(-1, k.CHANNELS)[source[label.ravel()[at]]]
-    rays, there = (np.stack([(p % w + row[k.U0] - optics.center[0]) / optics.focal[0],
-                             (p // w + row[k.V0] - optics.center[1]) / optics.focal[1], np.ones(len(p))], -1)
+    at = np.flatnonzero((_outline(pixels[..., lay.OUTSIDE]) & (reach < RIM_REACH_PX)).ravel())
+    plane = pixels.reshape(-1, lay.CHANNELS)[source[label.ravel()[at]]]
+    rays, there = (np.stack([(p % w + row[lay.U0] - rectified.center[0]) / rectified.focal[0],
+                             (p // w + row[lay.V0] - rectified.center[1]) / rectified.focal[1], np.ones(len(p))], -1)
                    for p in (at, source[label.ravel()[at]]))  # fmt: skip
-    normal, depth_m = plane[:, k.NX : k.NZ + 1], plane[:, k.Z]
+    normal, depth_m = plane[:, lay.NX : lay.NZ + 1], plane[:, lay.Z]
     slope = np.einsum("nj,nj->n", normal, rays)
     slope = np.where(np.abs(slope) < 0.05, np.nan, slope)
     at_rim_m = depth_m * np.einsum("nj,nj->n", normal, there) / slope
@@ -113,37 +115,37 @@ def _outline(outside: Float32[Array, "h w"]) -> Bool[Array, "h w"]:
 
 
 @dataclass(frozen=True, eq=False)
-class Opposed:
-    """Two sides to be compared, their views thinned out, and what they contradict themselves."""
+class Inconsistency:
+    """Inconsistency of two sides, their views thinned out, beside the inconsistency within each of them."""
 
     both: Sides
     rims: Rims
-    config: ContradictionConfig
+    config: ConsistencyConfig
 
     @staticmethod
-    def of(both: Sides, rims: Rims, config: ContradictionConfig) -> Opposed:
+    def of(both: Sides, rims: Rims, config: ConsistencyConfig) -> Inconsistency:
         """Of the joined views only some take part, from everywhere."""
-        directions = view_directions(both.common[both.theirs], both.pool.center_m)
-        return Opposed(replace(both, theirs=both.theirs[far_apart(directions, config.views)]), rims, config)
+        directions = view_directions(both.common[both.theirs], both.keyframes.center_m)
+        return Inconsistency(replace(both, theirs=both.theirs[far_apart(directions, config.views)]), rims, config)
 
     @cached_property
     def itself(self) -> Float[Array, " f"]:
         """Figures of pairs of views of the same toss, summed: the surface's (FIGURES), then the rim's."""
-        both, toss = self.both, self.both.pool.toss
+        both, toss = self.both, self.both.keyframes.toss
         views = np.concatenate([both.mine, both.theirs])
         pairs = [(i, j) for i in views for j in views if i != j and toss[i] == toss[j]]
         poses = both.common.copy()
-        poses[both.mine] = both.pool.poses[both.mine]
+        poses[both.mine] = both.keyframes.poses[both.mine]
         return self._figures(poses, np.array(pairs, dtype=np.int64).reshape(-1, 2))
 
     @cached_property
     def unlike(self) -> float:
-        """What the looks of two points cost that have nothing to do with each other."""
-        store, random = self.both.pool.store, np.random.default_rng(0)
-        looks = [_some_looks(store, views, random) for views in (self.both.mine, self.both.theirs)]
-        if min(len(x) for x in looks) == 0:
+        """Appearance cost of two points that have nothing to do with each other."""
+        store, random = self.both.keyframes.store, np.random.default_rng(0)
+        appearance = [_some_appearance(store, views, random) for views in (self.both.mine, self.both.theirs)]
+        if min(len(x) for x in appearance) == 0:
             return 0.0
-        gap = (looks[0] - looks[1]) / self.config.judged[0][k.INTENSITY]
+        gap = (appearance[0] - appearance[1]) / self.config.judged[0][k.INTENSITY]
         return float(np.minimum(gap**2 / 9, 1.0).mean())
 
     def aligned(
@@ -151,7 +153,7 @@ class Opposed:
     ) -> Float[Array, "4 4"]:
         """Gauss-Newton over all pairs of views of the two sides: nothing beside an outline, nothing before a surface,
         and the surfaces that both see together; `grounded`: what one stands on is where the table was."""
-        distance_m = float(np.median(np.linalg.norm(self.both.pool.store.center_m[self.both.mine], axis=1)))
+        distance_m = float(np.median(np.linalg.norm(self.both.keyframes.store.center_m[self.both.mine], axis=1)))
         pairs = self.pairs
         together = len(pairs) / (len(self.both.mine) + len(self.both.theirs))  # a view's pairs share its errors
         sign = np.where(np.isin(pairs[:, 0], self.both.mine), 1.0, -1.0)[:, None]
@@ -170,23 +172,33 @@ class Opposed:
         place = np.full(len(poses), -1)
         place[both.mine] = 0
         views = np.concatenate([both.mine, both.theirs])
-        replace(both.pool.footing, views=views).add(H[None, None], g[None], poses, place)
+        replace(both.keyframes.support_plane, views=views).add(H[None, None], g[None], poses, place)
 
     def cost(self, common_from_own: Float[Array, "4 4"]) -> float:
-        """What speaks against a placement, mean over the points: near 0 (or below) for the right one, where the two
-        sides contradict each other no more than each contradicts itself.
+        """Cost of a placement's inconsistency, mean over the points (no unit): near 0 (or below) for the right one,
+        where the two sides agree with each other as well as each agrees with itself.
 
-        Looks speak for a placement where they agree better than chance would have it, and against it where they do
-        not; looks of an object that is the same all over say nothing.
+        Appearance speaks for a placement where it agrees better than chance would have it, and against it where it does
+        not; that of an object that is the same all over says nothing.
         """
         f, own = self._figures(self.both.poses(common_from_own), self.pairs), self.itself
         apart = [_mean(x, c.BESIDE, c.COUNTED) + _mean(x, c.BEFORE, c.COUNTED) for x in (f, own)]
         rim = [_mean(x, c.FIGURES + c.BESIDE, c.FIGURES + c.COUNTED) for x in (f, own)]
         shared = _mean(f, c.SHARED, c.COUNTED)
         depth = _mean(f, c.DEPTH, c.SHARED) - _mean(own, c.DEPTH, c.SHARED)
-        looks = _against(_mean(f, c.LOOKS_COST, c.LOOKED), _mean(own, c.LOOKS_COST, c.LOOKED), self.unlike)
-        looked = _mean(f, c.LOOKED, c.COUNTED)
-        return apart[0] - apart[1] + self.config.rim_share * (rim[0] - rim[1]) + shared * depth + looked * looks
+        appearance = _against(
+            _mean(f, c.APPEARANCE_COST, c.APPEARANCE_WEIGHT),
+            _mean(own, c.APPEARANCE_COST, c.APPEARANCE_WEIGHT),
+            self.unlike,
+        )
+        appearance_share = _mean(f, c.APPEARANCE_WEIGHT, c.COUNTED)
+        return (
+            apart[0]
+            - apart[1]
+            + self.config.rim_share * (rim[0] - rim[1])
+            + shared * depth
+            + appearance_share * appearance
+        )
 
     def fitted(self, found: list[Fit]) -> list[Fit]:
         """Placements aligned and judged, different ones only, best first."""
@@ -200,15 +212,15 @@ class Opposed:
         return distinct([Fit(x, self.cost(x)) for x in fine])
 
     def all_around(self) -> list[Fit]:
-        """Placements sought over all turns about the two sides' middles, the best few, best first."""
+        """Placements sought over all rotations about the two sides' surface centers, the best few, best first."""
         few = replace(self.config, judged=self.config.seek)
-        thin = Opposed(replace(self.both, mine=_some(self.both.mine, self.config.seek_views),
+        thin = Inconsistency(replace(self.both, mine=_some(self.both.mine, self.config.seek_views),
                                theirs=_some(self.both.theirs, self.config.seek_views)), self.rims, few)  # fmt: skip
-        middle_own, middle_common = self.both.middles()
+        center_own_m, center_common_m = self.both.surface_centers_m()
         found = []
         for turn in all_turns(self.config.turns):
             start = np.eye(4)
-            start[:3, :3], start[:3, 3] = turn, middle_common - turn @ middle_own
+            start[:3, :3], start[:3, 3] = turn, center_common_m - turn @ center_own_m
             there = thin.aligned(start, self.config.seek)
             found.append(Fit(there, thin.cost(there)))
         return distinct(found)[: self.config.tried]
@@ -220,18 +232,18 @@ class Opposed:
         return np.concatenate([one_way, one_way[:, ::-1]])
 
     def _figures(self, poses: Float[Array, "n 4 4"], pairs: Int[Array, "m 2"]) -> Float[Array, " f"]:
-        distance_m = float(np.median(np.linalg.norm(self.both.pool.store.center_m[self.both.mine], axis=1)))
+        distance_m = float(np.median(np.linalg.norm(self.both.keyframes.store.center_m[self.both.mine], axis=1)))
         return self._terms(poses, pairs, rows(self.config.judged, distance_m)[0])[2]
 
     def _terms(
         self, poses: Float[Array, "n 4 4"], pairs: Int[Array, "m 2"], row: Float[Array, "7"]
     ) -> tuple[Float[Array, "m 6 6"], Float[Array, "m 6"], Float[Array, " f"]]:
-        return _compared(self.both.pool.store, self.rims, poses, pairs, row)
+        return _compared(self.both.keyframes.store, self.rims, poses, pairs, row)
 
 
 @dataclass(frozen=True, eq=False)
-class Contradictions:
-    """What views of different tosses contradict each other, for a refinement of all poses at once (joint_refinement.py)."""
+class ConsistencyTerms:
+    """Consistency terms between views of different tosses, for a refinement of all poses at once."""
 
     store: ViewStore
     rims: Rims
@@ -241,13 +253,15 @@ class Contradictions:
     """Of each pair: those of a view share its errors."""
 
     @staticmethod
-    def of(pool: Pool, rims: Rims, use: Bool[Array, " n"], config: ContradictionConfig) -> Contradictions:
+    def of(
+        keyframes: KeyframeDatabase, rims: Rims, use: Bool[Array, " n"], config: ConsistencyConfig
+    ) -> ConsistencyTerms:
         """Between all used views of different tosses."""
         views = np.flatnonzero(use)
-        pairs = [(int(i), int(j)) for i in views for j in views if pool.toss[i] != pool.toss[j]]
-        distance_m = float(np.median(np.linalg.norm(pool.store.center_m[use], axis=1)))
+        pairs = [(int(i), int(j)) for i in views for j in views if keyframes.toss[i] != keyframes.toss[j]]
+        distance_m = float(np.median(np.linalg.norm(keyframes.store.center_m[use], axis=1)))
         row = rows(config.fine, distance_m)[-1]
-        return Contradictions(pool.store, rims, np.array(pairs, dtype=np.int64).reshape(-1, 2), row,
+        return ConsistencyTerms(keyframes.store, rims, np.array(pairs, dtype=np.int64).reshape(-1, 2), row,
                               config.joint_share * len(views) / max(len(pairs), 1))  # fmt: skip
 
     def add(
@@ -264,14 +278,14 @@ def _compared(
     """Normal equations of each pair, surface and rim together; figures summed over pairs, the rim's last."""
     n = len(pairs)
     blocks, gradients, total = np.zeros((n, 6, 6)), np.zeros((n, 6)), []
-    views = np.ascontiguousarray(store.table[:, k.FIRST]), np.ascontiguousarray(store.table[:, k.COUNT])
+    views = np.ascontiguousarray(store.table[:, lay.FIRST]), np.ascontiguousarray(store.table[:, lay.COUNT])
     for points, first, count, rim in (
         (store.samples, *views, False),
         (rims.points_m, rims.first, rims.count, True),
     ):
         H, g, figures = np.zeros((n, 6, 6)), np.zeros((n, 6)), np.zeros((n, c.FIGURES))
-        c.contradictions(poses, pairs, store.maps, points, first, count, store.table, store.optics.focal,
-                         store.optics.center, row, rim, H, g, figures)  # fmt: skip
+        c.consistency_terms(poses, pairs, store.maps, points, first, count, store.table, store.rectified.focal,
+                            store.rectified.center, row, rim, H, g, figures)  # fmt: skip
         blocks, gradients = blocks + H, gradients + g
         total.append(figures.sum(0))
     return blocks, gradients, np.concatenate(total)
@@ -285,23 +299,23 @@ def _mean(figures: Float[Array, " f"], cost: int, weight: int) -> float:
     return float(figures[cost] / figures[weight]) if figures[weight] > 0 else 0.0
 
 
-def _some_looks(store: ViewStore, views: Int[Array, " a"], random: np.random.Generator) -> Float[Array, "n l"]:
-    """Looks of points drawn from all of some views, where the colour is the object's."""
-    spans = [(int(store.table[i, k.FIRST]), int(store.table[i, k.COUNT])) for i in views]
-    looks = np.concatenate([store.samples[a : a + n, k.SSHARP : k.SSHARP + k.LOOKS] for a, n in spans])
-    looks = looks[looks[:, 0] < 0.5 * k.NO_LOOK]
-    return looks[random.integers(0, len(looks), 4000)] if len(looks) else looks
+def _some_appearance(store: ViewStore, views: Int[Array, " a"], random: np.random.Generator) -> Float[Array, "n l"]:
+    """Appearance of points drawn from all of some views, where the colour is the object's."""
+    spans = [(int(store.table[i, lay.FIRST]), int(store.table[i, lay.COUNT])) for i in views]
+    appearance = np.concatenate([store.samples[a : a + n, lay.SSHARP : lay.SSHARP + lay.APPEARANCE] for a, n in spans])
+    appearance = appearance[appearance[:, 0] < 0.5 * lay.NO_APPEARANCE]
+    return appearance[random.integers(0, len(appearance), 4000)] if len(appearance) else appearance
 
 
-def _against(looks: float, itself: float, unlike: float) -> float:
-    """How far looks speak against a placement: their cost above that at which agreement is as likely as chance.
+def _against(appearance: float, itself: float, unlike: float) -> float:
+    """How far appearance speaks against a placement: its cost above that at which agreement is as likely as chance.
 
-    For looks that err with variance n and vary over the object with s, the likelihoods of "the same point" and of
-    "any two points" are equal at a cost of n ln(s / n) s / (s - n). Between tosses the light differs: n is twice what
-    the views of one toss err. The less the object's looks vary, the less they say.
+    For appearance that errs with variance n and varies over the object with s, the likelihoods of "the same point" and
+    of "any two points" are equal at a cost of n ln(s / n) s / (s - n). Between tosses the light differs: n is twice
+    what the views of one toss err. The less the object's appearance varies, the less it says.
     """
     noise = 2.0 * itself + 0.001
     ratio = unlike / noise
     if ratio <= 1.0:
         return 0.0
-    return (looks - noise * float(np.log(ratio)) * ratio / (ratio - 1.0)) * (1.0 - 1.0 / ratio)
+    return (appearance - noise * float(np.log(ratio)) * ratio / (ratio - 1.0)) * (1.0 - 1.0 / ratio)

@@ -1,7 +1,8 @@
 """Compiled comparison of views from everywhere around a body: not only of those that see the same side.
 
 Every point of a view's surface says something to every other view, whichever way it faces: it must not lie beside the
-other's outline, nor in front of what is seen there. Where both see the surface well, depth and looks must agree too.
+other's outline, nor in front of what is seen there. Where both see the surface well, depth and appearance must agree
+too.
 """
 
 from __future__ import annotations
@@ -11,11 +12,13 @@ from typing import no_type_check
 import numpy as np
 from numba import njit
 
+from processing.motion import se3_kernels as se3
+from processing.sensor import view_layout as lay
 from processing.track import kernels as k
 
-COUNTED, BESIDE, BEFORE, SHARED, DEPTH, LOOKED, LOOKS_COST = range(7)
+COUNTED, BESIDE, BEFORE, SHARED, DEPTH, APPEARANCE_WEIGHT, APPEARANCE_COST = range(7)
 """Columns of a pair's figures: points; sums of what they cost beside the outline and before the surface; weight of the
-points whose surface both see, and their depths' cost; weight of those with looks, and their cost."""
+points whose surface both see, and their depths' cost; weight of those with an appearance, and their appearance cost."""
 FIGURES = 7
 
 GRAZING, PLAIN = 0.2, 0.6
@@ -23,30 +26,36 @@ GRAZING, PLAIN = 0.2, 0.6
 SAME_SIDE = 0.7
 """Least cosine between two normals of one surface."""
 PULLED = 8.0
-"""Points that contradict by more scales than this pull no more."""
+"""Points that are inconsistent by more scales than this pull no more."""
 
 
 @no_type_check
 @njit(cache=True, nogil=True, fastmath=True)
-def contradictions(  # noqa: C901 (one hot loop)
+def consistency_terms(  # noqa: C901 (one hot loop)
     poses, pairs, maps, points, first, count, table, focal, center, row, rim, blocks, gradients, figures
 ):
     """Normal equations and figures of each pair (i, k): points of view i in view k.
 
     row: a schedule row as kernels.py has it. rim: the points are the body's extremes in their picture and have neither
-    normals nor looks; only the outline judges them, and not within a pixel. blocks (m, 6, 6), gradients (m, 6) for the
-    twist of i; that of k has the opposite sign. figures (m, FIGURES)."""
+    normals nor appearance; only the outline judges them, and not within a pixel. blocks (m, 6, 6), gradients (m, 6) for
+    the twist of i; that of k has the opposite sign. figures (m, FIGURES)."""
     # long because: one compiled loop over points
     fx, fy, cx, cy = focal[0], focal[1], center[0], center[1]
-    s_depth, s_looks, s_out = row[k.GEOMETRY_M], row[k.INTENSITY], row[k.OUTLINE_M]
-    w_depth, w_looks, w_out = 1.0 / (s_depth * s_depth), 1.0 / (s_looks * s_looks), 1.0 / (s_out * s_out)
+    s_depth, s_appearance, s_out = row[k.GEOMETRY_M], row[k.INTENSITY], row[k.OUTLINE_M]
+    w_depth, w_appearance, w_out = 1.0 / (s_depth * s_depth), 1.0 / (s_appearance * s_appearance), 1.0 / (s_out * s_out)
     level = int(row[k.LEVEL])
     step = max(1, int(np.round(1.0 / row[k.SHARE])))
     J, H, g = np.empty(6), np.empty((6, 6)), np.empty(6)
     for m in range(pairs.shape[0]):
         i, j = pairs[m, 0], pairs[m, 1]
-        pose = poses[j] @ k.inverse(poses[i])
-        off, u0, v0, w, h = table[j, k.OFFSET], table[j, k.U0], table[j, k.V0], table[j, k.WIDTH], table[j, k.HEIGHT]
+        pose = poses[j] @ se3.inverse(poses[i])
+        off, u0, v0, w, h = (
+            table[j, lay.OFFSET],
+            table[j, lay.U0],
+            table[j, lay.V0],
+            table[j, lay.WIDTH],
+            table[j, lay.HEIGHT],
+        )
         H[:], g[:] = 0.0, 0.0
         f = figures[m]
         f[:] = 0.0
@@ -67,7 +76,7 @@ def contradictions(  # noqa: C901 (one hot loop)
                 f[BESIDE] += 1.0
                 continue
             near = off + iv * w + iu
-            out = maps[near, k.OUTSIDE]
+            out = maps[near, lay.OUTSIDE]
             if out < 0.0:  # something nearer may stand there
                 f[COUNTED] -= 1.0
                 continue
@@ -76,16 +85,16 @@ def contradictions(  # noqa: C901 (one hot loop)
                 r = gap / s_out
                 f[BESIDE] += min(r * r / 9.0, 1.0)
                 if 0.0 < r < PULLED:
-                    du = 0.5 * (max(maps[near + 1, k.OUTSIDE], 0.0) - max(maps[near - 1, k.OUTSIDE], 0.0))
-                    dv = 0.5 * (max(maps[near + w, k.OUTSIDE], 0.0) - max(maps[near - w, k.OUTSIDE], 0.0))
+                    du = 0.5 * (max(maps[near + 1, lay.OUTSIDE], 0.0) - max(maps[near - 1, lay.OUTSIDE], 0.0))
+                    dv = 0.5 * (max(maps[near + w, lay.OUTSIDE], 0.0) - max(maps[near - w, lay.OUTSIDE], 0.0))
                     J[0], J[1] = du, dv * fy / fx
                     J[2] = -(du * x + dv * fy / fx * y) * iz
                     k._add(J, x, y, z, gap, w_out / (1.0 + r * r / 4.0), H, g)
                 continue
-            zr = maps[near, k.Z]
+            zr = maps[near, lay.Z]
             if rim or zr <= 0.0:
                 continue
-            nx, ny, nz = maps[near, k.NX], maps[near, k.NY], maps[near, k.NZ]
+            nx, ny, nz = maps[near, lay.NX], maps[near, lay.NY], maps[near, lay.NZ]
             mx = pose[0, 0] * p[3] + pose[0, 1] * p[4] + pose[0, 2] * p[5]
             my = pose[1, 0] * p[3] + pose[1, 1] * p[4] + pose[1, 2] * p[5]
             mz = pose[2, 0] * p[3] + pose[2, 1] * p[4] + pose[2, 2] * p[5]
@@ -107,12 +116,12 @@ def contradictions(  # noqa: C901 (one hot loop)
                 ju, jv = int(np.floor(u)), int(np.floor(v))
                 a, b = u - ju, v - jv
                 q = off + jv * w + ju
-                c0 = k.SHARP + level * k.LOOKS
+                c0 = lay.SHARP + level * lay.APPEARANCE
                 foreign = max(max(maps[q, c0], maps[q + 1, c0]), max(maps[q + w, c0], maps[q + w + 1, c0]))
-                if max(foreign, p[k.SSHARP]) > 0.5 * k.NO_LOOK:
+                if max(foreign, p[lay.SSHARP]) > 0.5 * lay.NO_APPEARANCE:
                     continue
-                f[LOOKED] += trust
-                for c in range(k.LOOKS):
+                f[APPEARANCE_WEIGHT] += trust
+                for c in range(lay.APPEARANCE):
                     i00, i10, i01, i11 = (
                         maps[q, c0 + c],
                         maps[q + 1, c0 + c],
@@ -120,16 +129,16 @@ def contradictions(  # noqa: C901 (one hot loop)
                         maps[q + w + 1, c0 + c],
                     )
                     above, below = i00 * (1 - a) + i10 * a, i01 * (1 - a) + i11 * a
-                    e = above * (1 - b) + below * b - p[k.SSHARP + level * k.LOOKS + c]
-                    r = e / s_looks
-                    f[LOOKS_COST] += trust * min(r * r / 9.0, 1.0) / k.LOOKS
+                    e = above * (1 - b) + below * b - p[lay.SSHARP + level * lay.APPEARANCE + c]
+                    r = e / s_appearance
+                    f[APPEARANCE_COST] += trust * min(r * r / 9.0, 1.0) / lay.APPEARANCE
                     if abs(r) < 3.0:
                         gu, gv = (i10 - i00) * (1 - b) + (i11 - i01) * b, below - above
                         slope = gu * gu + gv * gv
                         kept = trust * (1.0 - r * r / 9.0) * slope / (slope + k.LEAST_SLOPE * k.LEAST_SLOPE)
                         gu, gv = gu * fx * iz, gv * fy * iz
                         J[0], J[1], J[2] = gu, gv, -(gu * x + gv * y) * iz
-                        k._add(J, x, y, z, e, w_looks * kept * kept, H, g)
+                        k._add(J, x, y, z, e, w_appearance * kept * kept, H, g)
             elif ahead_m > 0.0 and zr > z and there > GRAZING:
                 r = ahead_m / s_out
                 f[BEFORE] += min(r * r / 9.0, 1.0)

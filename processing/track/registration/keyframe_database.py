@@ -9,17 +9,17 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray as Array
 
+from processing.sensor import view_layout as lay
 from processing.sensor.view import ViewStore
-from processing.track import kernels as k
 from processing.track.keyframes import view_directions
-from processing.track.known_shape import ShapeConfig, middle_of, shape_views
-from processing.track.registration.support_plane import Footing, FootingConfig, footing
+from processing.track.known_shape import ShapeConfig, center_of, shape_views
+from processing.track.registration.support_plane import SupportPlane, SupportPlaneConfig, support_plane
 from processing.track.track_toss import TossTrack
 from recordings.tracks import ObjectShape
 
 
 @dataclass(frozen=True, eq=False)
-class Pool:
+class KeyframeDatabase:
     """The chosen keyframes of all tosses in one store: poses in each toss's own frame, and whose they are."""
 
     store: ViewStore
@@ -27,14 +27,14 @@ class Pool:
     toss: Int[Array, " n"]
     frame: Int[Array, " n"]
     center_m: Float[Array, "3"]
-    footing: Footing
+    support_plane: SupportPlane
 
 
 @dataclass(frozen=True, eq=False)
 class Sides:
     """Views of one toss (`mine`, poses in its own frame), and those that it is to join (`theirs`, common frame)."""
 
-    pool: Pool
+    keyframes: KeyframeDatabase
     mine: Int[Array, " a"]
     theirs: Int[Array, " b"]
     common: Float[Array, "n 4 4"]
@@ -43,57 +43,65 @@ class Sides:
     def poses(self, common_from_own: Float[Array, "4 4"]) -> Float[Array, "n 4 4"]:
         """Poses in the common frame, where the toss lies so."""
         out = self.common.copy()
-        out[self.mine] = self.pool.poses[self.mine] @ np.linalg.inv(common_from_own)
+        out[self.mine] = self.keyframes.poses[self.mine] @ np.linalg.inv(common_from_own)
         return out
 
-    def middles(self) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
-        """Middle of the surface that either side's views see: of mine in the own frame, of theirs in the common one."""
-        return _middle(self.pool.store, self.mine, self.pool.poses), _middle(self.pool.store, self.theirs, self.common)
+    def surface_centers_m(self) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+        """Center of the surface that either side's views see: of mine in the own frame, of theirs in the common one."""
+        return _surface_center_m(self.keyframes.store, self.mine, self.keyframes.poses), _surface_center_m(
+            self.keyframes.store, self.theirs, self.common
+        )
 
 
-def pooled(
+def keyframes_of(
     tosses: Sequence[TossTrack], model: ObjectShape | None, keyframes: Sequence[int], shape: ShapeConfig,
-    ground: FootingConfig,
-) -> Pool:  # fmt: skip
+    ground: SupportPlaneConfig,
+) -> KeyframeDatabase:  # fmt: skip
     """So many keyframes of each toss; after them the drawn views of a learned shape, as if they were one more toss."""
     chosen = [_spread(t, count) for t, count in zip(tosses, keyframes)]
     stores = [t.store.only(c) for t, c in zip(tosses, chosen)]
     poses = [t.track.camera_from_object[c] for t, c in zip(tosses, chosen)]
     center_m = tosses[0].center_m
     if model is not None:
-        drawn = shape_views(model, [c for s in stores for c in s.crops], stores[0].optics, shape)
-        stores.append(ViewStore(stores[0].optics, list(drawn.crops), stores[0].config))
+        drawn = shape_views(model, [c for s in stores for c in s.crops], stores[0].rectified, shape)
+        stores.append(ViewStore(stores[0].rectified, list(drawn.crops), stores[0].config))
         for i in range(len(drawn.crops)):
             stores[-1].fill(i)
         poses.append(drawn.poses)
         chosen.append(np.arange(len(drawn.crops)))
-        center_m = middle_of(model)
+        center_m = center_of(model)
     whose = np.concatenate([np.full(len(c), i) for i, c in enumerate(chosen)])
     store, frame = ViewStore.joined(stores), np.concatenate(chosen)
-    return Pool(store, np.concatenate(poses), whose, frame, center_m, _footing(tosses, store, whose, frame, ground))
+    return KeyframeDatabase(
+        store, np.concatenate(poses), whose, frame, center_m, _support_plane(tosses, store, whose, frame, ground)
+    )
 
 
-def _footing(
+def _support_plane(
     tosses: Sequence[TossTrack], store: ViewStore, whose: Int[Array, " n"], frame: Int[Array, " n"],
-    config: FootingConfig,
-) -> Footing:  # fmt: skip
+    config: SupportPlaneConfig,
+) -> SupportPlane:  # fmt: skip
     """Where the keyframes stand on the table (a learned shape's views do not)."""
-    out = Footing(store, np.arange(len(store)), np.full(len(store), -1), np.full((len(store), 4), np.nan), config)
+    out = SupportPlane(store, np.arange(len(store)), np.full(len(store), -1), np.full((len(store), 4), np.nan), config)
     for n, toss in enumerate(tosses):
-        own, mine = footing(toss.store, toss.track.camera_from_object, _usable(toss), config), whose == n
+        own, mine = support_plane(toss.store, toss.track.camera_from_object, _usable(toss), config), whose == n
         stand = own.stand[frame[mine]]
         out.stand[mine] = np.where(stand >= 0, len(tosses) * stand + n, -1)
         out.planes[mine] = own.planes[frame[mine]]
     return out
 
 
-def sides(pool: Pool, toss: int, joined: Int[Array, " j"], first_from_own: Float[Array, "t 4 4"]) -> Sides:
+def sides(
+    keyframes: KeyframeDatabase, toss: int, joined: Int[Array, " j"], first_from_own: Float[Array, "t 4 4"]
+) -> Sides:
     """Views of a toss, and those of the joined tosses."""
-    common = pool.poses.copy()
+    common = keyframes.poses.copy()
     for j in joined:
-        rows = pool.toss == j
-        common[rows] = pool.poses[rows] @ np.linalg.inv(first_from_own[j])
-    return Sides(pool, np.flatnonzero(pool.toss == toss), np.flatnonzero(np.isin(pool.toss, joined)), common)
+        rows = keyframes.toss == j
+        common[rows] = keyframes.poses[rows] @ np.linalg.inv(first_from_own[j])
+    return Sides(
+        keyframes, np.flatnonzero(keyframes.toss == toss), np.flatnonzero(np.isin(keyframes.toss, joined)), common
+    )
 
 
 def far_apart(directions: Float[Array, "n 3"], count: int) -> Int[Array, " m"]:
@@ -129,13 +137,13 @@ def _usable(toss: TossTrack) -> Int[Array, " m"]:
     return np.array([i for i in range(len(status)) if status[i] == "tracked" and toss.store.usable(i)], dtype=np.int64)
 
 
-def _middle(store: ViewStore, views: Int[Array, " a"], poses: Float[Array, "n 4 4"]) -> Float[Array, "3"]:
-    """Middle of the surface seen by several views, object frame."""
+def _surface_center_m(store: ViewStore, views: Int[Array, " a"], poses: Float[Array, "n 4 4"]) -> Float[Array, "3"]:
+    """Center of the surface seen by several views, object frame."""
     seen = []
     for i in views:
         back = np.linalg.inv(poses[i])
         row = store.table[i]
-        points = store.samples[row[k.FIRST] : row[k.FIRST] + row[k.COUNT] : 5, :3]
+        points = store.samples[row[lay.FIRST] : row[lay.FIRST] + row[lay.COUNT] : 5, :3]
         seen.append(points @ back[:3, :3].T + back[:3, 3])
     cloud = np.concatenate(seen)
     return np.asarray(0.5 * (np.quantile(cloud, 0.02, axis=0) + np.quantile(cloud, 0.98, axis=0)))

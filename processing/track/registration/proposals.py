@@ -1,5 +1,5 @@
-"""Registrations of one toss to others that looks propose: feature matches between keyframes, aligned where views see
-the same side."""
+"""Registrations of one toss to others that appearance proposes: feature matches between keyframes, aligned where views
+see the same side."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from jaxtyping import Float, Int
 from numpy import ndarray as Array
 
 from processing.features.sift import FeatureMatcher, Features, RansacConfig, relative_motions
+from processing.motion import se3_kernels as se3
 from processing.track import kernels as k
 from processing.track.beam import Schedule, rows
 from processing.track.keyframes import view_directions
@@ -24,7 +25,7 @@ class ProposeConfig:
     """Proposals aligned, the most supported first."""
     kept: int = 5
     """The best of them that are aligned finely."""
-    doubt: float = 0.10
+    uncertain_cost: float = 0.10
     """A registration by features that fits worse is not sure."""
     sure_votes: float = 80.0
     """Feature matches that must agree on a registration, and on no other half as many, or it is not sure."""
@@ -48,7 +49,7 @@ APART_DEG = 15.0
 
 
 def distinct(found: list[Fit]) -> list[Fit]:
-    """Sorted by cost, without those that say the same as a better one."""
+    """Sorted by cost, without those that agree with a better one."""
     kept: list[Fit] = []
     least = 1 + 2 * np.cos(np.radians(APART_DEG))
     for f in sorted(found, key=lambda f: f.cost):
@@ -61,30 +62,30 @@ def distinct(found: list[Fit]) -> list[Fit]:
 def by_features(
     both: Sides, features: dict[int, Features], matcher: FeatureMatcher, config: ProposeConfig
 ) -> tuple[list[Fit], bool]:
-    """Different registrations that feature matches say, aligned, best first (cost: mean over pairs of views that see
-    the same side, 0 perfect .. 1), and whether the matches leave no doubt about the first."""
+    """Different registrations that feature matches support, aligned, best first (cost: mean over pairs of views that
+    see the same side, 0 perfect .. 1), and whether the matches make the first certain."""
     proposals, votes = _proposed(both, features, matcher, config)
     rough = [_aligned(both, p, config.coarse, config.pairs // 2, config) for p in proposals]
     good = distinct(rough)[: config.kept]
     found = distinct([_aligned(both, r.first_from_own, config.fine, config.pairs, config) for r in good])
     second = max(votes[1:], default=0.0)
     sure = bool(votes) and votes[0] >= config.sure_votes and second < 0.5 * votes[0]
-    return found, sure and bool(found) and found[0].cost <= config.doubt
+    return found, sure and bool(found) and found[0].cost <= config.uncertain_cost
 
 
 def _proposed(
     both: Sides, features: dict[int, Features], matcher: FeatureMatcher, config: ProposeConfig
 ) -> tuple[list[Float[Array, "4 4"]], list[float]]:
-    """Transforms that feature matches between keyframes say, the most supported first, near copies merged, and how
+    """Transforms that feature matches between keyframes support, the most supported first, near copies merged, and how
     many matches support each."""
     for i in (*both.mine, *both.theirs):
         if int(i) not in features:
-            features[int(i)] = matcher.describe(both.pool.store, int(i))
+            features[int(i)] = matcher.describe(both.keyframes.store, int(i))
     found: list[tuple[float, Float[Array, "4 4"]]] = []
     for i in both.mine:
         for j in both.theirs:
             for m in relative_motions(matcher, features[int(i)], features[int(j)], config.ransac, seed=int(i), most=1):
-                transform = np.linalg.inv(both.common[j]) @ m.other_from_one @ both.pool.poses[i]
+                transform = np.linalg.inv(both.common[j]) @ m.other_from_one @ both.keyframes.poses[i]
                 found.append((float(m.inliers), transform))
     return _voted(found, config.tried)
 
@@ -105,7 +106,7 @@ def _voted(found: list[tuple[float, Float[Array, "4 4"]]], most: int) -> tuple[l
 
 def _aligned(both: Sides, transform: Float[Array, "4 4"], schedule: Schedule, pairs: int, config: ProposeConfig) -> Fit:
     """Gauss-Newton of one transform (common_from_own) over the pairs of views that see the same side; its mean cost."""
-    store, cost = both.pool.store, np.inf
+    store, cost = both.keyframes.store, np.inf
     for row in rows(schedule, float(np.median(np.linalg.norm(store.center_m[both.mine], axis=1)))):
         for _ in range(int(row[k.STEPS])):
             poses = both.poses(transform)
@@ -115,8 +116,8 @@ def _aligned(both: Sides, transform: Float[Array, "4 4"], schedule: Schedule, pa
             blocks, gradients = np.zeros((len(chosen), 6, 6)), np.zeros((len(chosen), 6))
             figures = np.zeros((len(chosen), 3))
             k.graph_terms(
-                poses, chosen, store.maps, store.samples, store.table, store.optics.focal, store.optics.center, row,
-                blocks, gradients, figures,
+                poses, chosen, store.maps, store.samples, store.table, store.rectified.focal, store.rectified.center,
+                row, blocks, gradients, figures,
             )  # fmt: skip
             cost = float(figures[:, 0].mean())
             sign = np.where(np.isin(chosen[:, 0], both.mine), 1.0, -1.0)
@@ -128,12 +129,12 @@ def stepped(transform: Float[Array, "4 4"], H: Float[Array, "6 6"], g: Float[Arr
     """One damped Gauss-Newton step of common_from_own, at most 3 cm and a quarter radian."""
     step = -np.linalg.solve(H + np.diag(1e-5 * np.diag(H) + 1e-9 * np.trace(H) + 1e-9), g)
     size = max(np.linalg.norm(step[:3]) / 0.03, np.linalg.norm(step[3:]) / 0.25, 1.0)
-    return np.asarray(k.exponential(step / size) @ transform)
+    return np.asarray(se3.exponential(step / size) @ transform)
 
 
 def _facing_pairs(both: Sides, poses: Float[Array, "n 4 4"], count: int, config: ProposeConfig) -> Int[Array, "m 2"]:
     """Pairs of views of the two sides, both ways, nearest directions first."""
-    center_m = both.pool.center_m
+    center_m = both.keyframes.center_m
     cosine = view_directions(poses[both.mine], center_m) @ view_directions(poses[both.theirs], center_m).T
     order = np.argsort(-cosine, axis=None)[:count]
     order = order[cosine.ravel()[order] > np.cos(np.radians(config.co_visible_deg))]

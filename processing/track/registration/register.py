@@ -1,10 +1,10 @@
-"""Brings several tosses of one object into one object frame: appearance and a search all around propose, whatever
-contradicts a proposal in any two views judges, and all keyframes of all tosses are refined together.
+"""Brings several tosses of one object into one object frame: appearance and a search all around propose, a proposal is
+judged by its consistency in any two views, and all keyframes of all tosses are refined together.
 
-Tosses join one by one, those that leave no doubt first. Feature matches between keyframes propose (proposals.py); where
-they are not sure, placements are sought over all turns, too (consistency.py): two tosses need not show a common side.
-Every proposal is judged by what contradicts it over all pairs of views, and the one that is contradicted least is
-taken. A toss that is contradicted everywhere is left out and said to be.
+Tosses join one by one, the certain ones first. Feature matches between keyframes propose (proposals.py); where they are
+not sure, placements are sought over all turns, too (consistency.py): two tosses need not show a common side. Every
+proposal is judged by its inconsistency over all pairs of views, and the most consistent one is taken. A toss that is
+inconsistent everywhere is left out and reported.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray as Array
 
 from processing.features.sift import FeatureMatcher, Features, Sift
+from processing.motion.interpolate import blended
 from processing.track.joint_refinement import GraphConfig, Motion, refine
 from processing.track.known_shape import ShapeConfig
-from processing.track.registration.consistency import ContradictionConfig, Contradictions, Opposed, Rims
-from processing.track.registration.keyframe_database import Pool, pooled, sides
+from processing.track.registration.consistency import ConsistencyConfig, ConsistencyTerms, Inconsistency, Rims
+from processing.track.registration.keyframe_database import KeyframeDatabase, keyframes_of, sides
 from processing.track.registration.proposals import Fit, ProposeConfig, by_features
-from processing.track.registration.support_plane import FootingConfig
+from processing.track.registration.support_plane import SupportPlaneConfig
 from processing.track.track_toss import TossTrack
 from recordings.errors import BadInput
-from recordings.geometry import rotation_exp, rotation_log
 from recordings.progress import Progress, Silent
 from recordings.tracks import ObjectShape, ObjectTrack
 
@@ -41,18 +41,18 @@ class RegisterConfig:
     many: int = 40
     """... so that there are about so many; of a toss that they leave ambiguous so many alone."""
     worst: float = 0.05
-    """A toss whose best placement is contradicted more is left out."""
+    """A toss whose best placement costs more (inconsistency) is left out."""
     good: float = 0.01
-    """A sure proposal that is contradicted more is no longer sure."""
+    """A sure proposal that costs more is no longer sure."""
     ambiguous: float = 0.003
-    """Another placement that is contradicted more by less than this may be the right one."""
+    """Another placement that costs more by less than this may be the right one."""
     rivals: float = 0.06
     """Of sure proposals, those that fit worse than the first by less than this are judged beside it."""
     propose: ProposeConfig = field(default_factory=ProposeConfig)
-    contradiction: ContradictionConfig = field(default_factory=ContradictionConfig)
+    consistency: ConsistencyConfig = field(default_factory=ConsistencyConfig)
     joint: GraphConfig = field(default_factory=lambda: GraphConfig(loops=10, neighbours=1))
     shape: ShapeConfig = field(default_factory=ShapeConfig)
-    ground: FootingConfig = field(default_factory=FootingConfig)
+    ground: SupportPlaneConfig = field(default_factory=SupportPlaneConfig)
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,9 +60,9 @@ class Registered:
     """All tracks in the object frame of the first; `fit` per toss (near 0 or below good, see consistency.py; 0 for
     the first), `joined` says which could be registered: the others keep their own frame. `first_from_own` 4x4 per toss.
 
-    `gap` per toss: how much more the best different placement is contradicted (infinite: there is none); where that is
+    `gap` per toss: how much more the best different placement costs (infinite: there is none); where that is
     less than the settings' `ambiguous`, the toss is `ambiguous`: the object looks the same from several sides, and
-    nothing in the images tells which one is right.
+    nothing in the images decides which one is right.
     """
 
     tracks: tuple[ObjectTrack, ...]
@@ -77,7 +77,7 @@ class Registered:
 class _Placing:
     """Where each toss lies so far (NaN fit: nowhere yet), and what others are compared with."""
 
-    pool: Pool
+    keyframes: KeyframeDatabase
     rims: Rims
     matcher: FeatureMatcher
     config: RegisterConfig
@@ -87,20 +87,20 @@ class _Placing:
     known: dict[tuple[int, ...], list[Fit]] = field(default_factory=dict)
     """What was found of a toss (first number) against others."""
 
-    def opposed(self, toss: int, many: Pool | None = None) -> Opposed | None:
-        """A toss against all others that are placed, by all views of another pool where one is given; None where
-        either has no view."""
+    def inconsistency(self, toss: int, many: KeyframeDatabase | None = None) -> Inconsistency | None:
+        """A toss against all others that are placed, by all views of another keyframe database where one is given; None
+        where either has no view."""
         joined = np.flatnonzero(np.isfinite(self.fit) & (np.arange(len(self.fit)) != toss))
-        pool, rims, config = self.pool, self.rims, self.config.contradiction
+        keyframes, rims, config = self.keyframes, self.rims, self.config.consistency
         if many is not None:
-            pool, rims, config = many, Rims.of(many.store), replace(config, views=self.config.many)
-        both = sides(pool, toss, joined, self.first_from_own)
+            keyframes, rims, config = many, Rims.of(many.store), replace(config, views=self.config.many)
+        both = sides(keyframes, toss, joined, self.first_from_own)
         if len(both.mine) == 0 or len(both.theirs) == 0:
             return None
-        return Opposed.of(both, rims, config)
+        return Inconsistency.of(both, rims, config)
 
     def found(self, toss: int) -> list[Fit]:
-        """Different placements of a toss, the least contradicted first."""
+        """Different placements of a toss, the most consistent first."""
         joined = np.flatnonzero(np.isfinite(self.fit))
         key = (toss, *map(int, joined))
         if key not in self.known:
@@ -108,10 +108,10 @@ class _Placing:
         return self.known[key]
 
     def _found(self, toss: int, joined: Int[Array, " j"]) -> list[Fit]:
-        against = self.opposed(toss)
+        against = self.inconsistency(toss)
         if against is None:
             return []
-        both = sides(self.pool, toss, joined, self.first_from_own)
+        both = sides(self.keyframes, toss, joined, self.first_from_own)
         proposed, sure = by_features(both, self.features, self.matcher, self.config.propose)
         if sure and against.cost(proposed[0].first_from_own) < self.config.good:
             rivals = [f for f in proposed if f.cost < proposed[0].cost + self.config.rivals]
@@ -121,7 +121,7 @@ class _Placing:
         return against.fitted([*proposed, *against.all_around()])
 
     def place(self, toss: int, found: list[Fit], most: float) -> bool:
-        """Take the best placement, if it is not contradicted by more than `most`."""
+        """Take the best placement, if its inconsistency costs no more than `most`."""
         if not found or found[0].cost > most:
             return False
         self.first_from_own[toss], self.fit[toss] = found[0].first_from_own, found[0].cost
@@ -149,38 +149,42 @@ def register_tosses(
     if len({t.track.camera for t in tosses}) > 1:
         raise BadInput(f"tracks of several cameras ({sorted({t.track.camera for t in tosses})}); wanted one camera")
     views = int(np.clip(config.many // len(tosses), config.keyframes, config.most_keyframes))
-    pool = pooled(tosses, model, [views] * len(tosses), config.shape, config.ground)
+    keyframes = keyframes_of(tosses, model, [views] * len(tosses), config.shape, config.ground)
     root, count = (0, len(tosses)) if model is None else (len(tosses), len(tosses) + 1)
     fit = np.zeros(count) if together else np.where(np.arange(count) == root, 0.0, np.nan)
-    placing = _Placing(pool, Rims.of(pool.store), matcher, config, np.tile(np.eye(4), (count, 1, 1)), fit)
+    placing = _Placing(keyframes, Rims.of(keyframes.store), matcher, config, np.tile(np.eye(4), (count, 1, 1)), fit)
     gap = np.full(count, np.inf)
     if not together:
         others = [t for t in range(len(tosses)) if t != root]
         gap = _placed(placing, others, lambda t: _many_views(tosses, model, t, config), progress)
-    fixed = pool.toss == root
+    fixed = keyframes.toss == root
     if model is None:
         fixed[1:] = False
-    poses = _refined(pool, placing.rims, np.isfinite(fit), placing.first_from_own, fixed, _tied(tosses, pool), config)
+    poses = _refined(
+        keyframes, placing.rims, np.isfinite(fit), placing.first_from_own, fixed, _tied(tosses, keyframes), config
+    )
     fit, gap, first_from_own = fit[: len(tosses)], gap[: len(tosses)], placing.first_from_own[: len(tosses)]
-    tracks = [_moved_track(toss, pool, t, poses, bool(np.isfinite(fit[t]))) for t, toss in enumerate(tosses)]
+    tracks = [_moved_track(toss, keyframes, t, poses, bool(np.isfinite(fit[t]))) for t, toss in enumerate(tosses)]
     joined = np.isfinite(fit)
     unsure = joined & (gap < config.ambiguous)
     return Registered(tuple(tracks), tuple(map(bool, joined)), fit, first_from_own, gap, tuple(map(bool, unsure)))
 
 
-def _many_views(tosses: Sequence[TossTrack], model: ObjectShape | None, toss: int, config: RegisterConfig) -> Pool:
+def _many_views(
+    tosses: Sequence[TossTrack], model: ObjectShape | None, toss: int, config: RegisterConfig
+) -> KeyframeDatabase:
     """Many views of one toss, and together as many of the others."""
     of_others = max(config.keyframes, config.many // max(len(tosses) - 1, 1))
     counts = [config.many if t == toss else of_others for t in range(len(tosses))]
-    return pooled(tosses, model, counts, config.shape, config.ground)
+    return keyframes_of(tosses, model, counts, config.shape, config.ground)
 
 
 def _placed(
-    placing: _Placing, tosses: list[int], many: Callable[[int], Pool], progress: Progress
+    placing: _Placing, tosses: list[int], many: Callable[[int], KeyframeDatabase], progress: Progress
 ) -> Float[Array, " t"]:
-    """Places tosses one by one: those first that leave no doubt, because others may then be told apart by what these
-    show. A toss that stays ambiguous is judged by `many` views. Returns how much more the best different placement of
-    each is contradicted."""
+    """Places tosses one by one: the certain ones first, because others may then be distinguished by what these show. A
+    toss that stays ambiguous is judged by `many` views. Returns how much more the best different placement of each
+    costs."""
     config, waiting, found = placing.config, list(tosses), dict[int, list[Fit]]()
     for most, least_gap in ((0.5 * config.worst, config.ambiguous), (0.5 * config.worst, 0.0), (config.worst, 0.0)):
         for t in list(waiting):
@@ -191,12 +195,12 @@ def _placed(
     gap = np.full(len(placing.fit), np.inf)
     for t in tosses:
         rivals = [f for f in found[t] if f.cost < found[t][0].cost + 3 * config.ambiguous]
-        against = placing.opposed(t)
+        against = placing.inconsistency(t)
         if t in waiting or len(rivals) < 2 or against is None:
             gap[t] = _gap(found[t])
             continue
         again = against.fitted(rivals)  # now against all the others
-        closer = placing.opposed(t, many(t)) if _gap(again) < config.ambiguous else None
+        closer = placing.inconsistency(t, many(t)) if _gap(again) < config.ambiguous else None
         if closer is not None:
             again = closer.judged(again)
         placing.place(t, again, np.inf)
@@ -204,64 +208,51 @@ def _placed(
     return gap
 
 
-def _tied(tosses: Sequence[TossTrack], pool: Pool) -> Int[Array, " n"]:
+def _tied(tosses: Sequence[TossTrack], keyframes: KeyframeDatabase) -> Int[Array, " n"]:
     """Views with the same number move as one; those with -1 alone."""
-    out = np.full(len(pool.toss), -1)
+    out = np.full(len(keyframes.toss), -1)
     for n, toss in enumerate(tosses):
-        mine = pool.toss == n
-        tied = toss.tied[pool.frame[mine]]
+        mine = keyframes.toss == n
+        tied = toss.tied[keyframes.frame[mine]]
         out[mine] = np.where(tied >= 0, len(tosses) * tied + n, -1)
     return out
 
 
 def _gap(found: list[Fit]) -> float:
-    """How much more the second of several placements is contradicted than the first."""
+    """How much more the second of several placements costs than the first."""
     return found[1].cost - found[0].cost if len(found) > 1 else float("inf")
 
 
 def _refined(
-    pool: Pool, rims: Rims, joined: Bool[Array, " t"], first_from_own: Float[Array, "t 4 4"], fixed: Bool[Array, " n"],
-    tied: Int[Array, " n"], config: RegisterConfig,
+    keyframes: KeyframeDatabase, rims: Rims, joined: Bool[Array, " t"], first_from_own: Float[Array, "t 4 4"],
+    fixed: Bool[Array, " n"], tied: Int[Array, " n"], config: RegisterConfig,
 ) -> Float[Array, "n 4 4"]:  # fmt: skip
     """All keyframes of all joined tosses at once (the first toss's first one is fixed, or a learned shape's views);
     poses in the common frame. Views with the same number in `tied` move as one."""
-    poses = np.array([p @ np.linalg.inv(first_from_own[t]) for p, t in zip(pool.poses, pool.toss)])
-    use = joined[pool.toss]
+    poses = np.array([p @ np.linalg.inv(first_from_own[t]) for p, t in zip(keyframes.poses, keyframes.toss)])
+    use = joined[keyframes.toss]
     none = np.zeros(len(poses), dtype=bool)
-    # keyframes are far apart in time: the pull towards free flight says nothing between them
-    motion = Motion(pool.frame.astype(np.float64), np.arange(len(poses)), np.zeros(3), pool.center_m, none)
+    # keyframes are far apart in time: the pull towards free flight has no meaning between them
+    motion = Motion(keyframes.frame.astype(np.float64), np.arange(len(poses)), np.zeros(3), keyframes.center_m, none)
     graph = replace(config.joint, spread_in_time=1)
     beside = (
-        replace(pool.footing, views=np.flatnonzero(use)),
-        Contradictions.of(pool, rims, use, config.contradiction),
+        replace(keyframes.support_plane, views=np.flatnonzero(use)),
+        ConsistencyTerms.of(keyframes, rims, use, config.consistency),
     )
-    return refine(pool.store, poses, use, fixed, motion, graph, tied=tied, beside=beside).poses
+    return refine(keyframes.store, poses, use, fixed, motion, graph, tied=tied, beside=beside).poses
 
 
 def _moved_track(
-    toss: TossTrack, pool: Pool, t: int, poses: Float[Array, "n 4 4"], joined: bool,
+    toss: TossTrack, keyframes: KeyframeDatabase, t: int, poses: Float[Array, "n 4 4"], joined: bool,
 ) -> ObjectTrack:  # fmt: skip
     """The toss's track in the common frame: each frame moved by the mean correction of the keyframes around it."""
     track = toss.track
     if not joined:
         return track
-    mine = np.flatnonzero(pool.toss == t)
-    corrections = np.array([np.linalg.inv(poses[i]) @ pool.poses[i] for i in mine])  # common_from_own per keyframe
+    mine = np.flatnonzero(keyframes.toss == t)
+    corrections = np.array([np.linalg.inv(poses[i]) @ keyframes.poses[i] for i in mine])  # common_from_own per keyframe
     out = track.camera_from_object.copy()
     for i in range(len(out)):
         if track.status[i] != "lost":
-            out[i] = out[i] @ np.linalg.inv(_blended(corrections, pool.frame[mine], i))
+            out[i] = out[i] @ np.linalg.inv(blended(corrections, keyframes.frame[mine], i))
     return replace(track, camera_from_object=out)
-
-
-def _blended(corrections: Float[Array, "m 4 4"], frames: Int[Array, " m"], i: int) -> Float[Array, "4 4"]:
-    """Correction at frame i: linear between the keyframes around it."""
-    after = int(np.searchsorted(frames, i))
-    if after == 0 or after == len(frames):
-        return corrections[min(after, len(frames) - 1)]
-    a, b = corrections[after - 1], corrections[after]
-    share = (i - frames[after - 1]) / (frames[after] - frames[after - 1])
-    out = np.eye(4)
-    out[:3, :3] = a[:3, :3] @ rotation_exp(share * rotation_log(a[:3, :3].T @ b[:3, :3]))
-    out[:3, 3] = (1 - share) * a[:3, 3] + share * b[:3, 3]
-    return out

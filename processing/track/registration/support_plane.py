@@ -14,20 +14,22 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray as Array
 
-from processing.motion.motion_prior import turn_between
+from processing.motion import se3_kernels as se3
+from processing.motion.interpolate import turn_between
+from processing.sensor import view_layout as lay
 from processing.sensor.view import ViewStore
-from processing.track import kernels as k
 from processing.track.revolution.unwrapping import table_of
+from recordings.robust import tukey_weight
 
 
 @dataclass(frozen=True)
-class FootingConfig:
+class SupportPlaneConfig:
     """Which points lie on the table, and how exactly."""
 
     facing: float = 0.95
     """Least cosine between a surface's normal and the way down."""
     seen: float = 0.3
-    """A surface that faces its camera by less than this cosine says nothing."""
+    """A surface that faces its camera by less than this cosine does not count."""
     near_m: float = 0.01
     """What is farther from the table does not lie on it (Tukey's biweight)."""
     point_m: float = 0.0035
@@ -48,7 +50,7 @@ class FootingConfig:
 
 
 @dataclass(frozen=True, eq=False)
-class Footing:
+class SupportPlane:
     """Views of one or several tosses, and in which of them the body stands on the table: `stand` (n) numbers the times
     that it stands (-1: it does not), `planes` are the table's in each view's camera axes (unit normal; NaN: unknown);
     `views` are those that take part."""
@@ -57,7 +59,7 @@ class Footing:
     views: Int[Array, " m"]
     stand: Int[Array, " n"]
     planes: Float[Array, "n 4"]
-    config: FootingConfig
+    config: SupportPlaneConfig
 
     def add(
         self, H: Float[Array, "f f 6 6"], g: Float[Array, "f 6"], poses: Float[Array, "n 4 4"], place: Int[Array, " n"]
@@ -80,7 +82,7 @@ class Footing:
         total, weighed = c.plane_m**-2, 0.0
         shared = np.zeros((len(g), 6))
         for i in self.views[self.views != stand]:
-            back = k.inverse(poses[i])
+            back = se3.inverse(poses[i])
             points, facing = self._facing(int(i), poses[i, :3, :3] @ normal)
             points = points @ back[:3, :3].T + back[:3, 3]
             above = points @ normal + height
@@ -88,7 +90,7 @@ class Footing:
             if on.sum() < c.least_points:
                 continue
             points, above = points[on], above[on]
-            w = (1 - (above / c.near_m) ** 2) ** 2 / c.point_m**2
+            w = tukey_weight(above / c.near_m) / c.point_m**2
             total, weighed = total + float(w.sum()), weighed + float(w @ above)
             J = np.column_stack([np.tile(normal, (len(points), 1)), np.cross(points, normal)])
             A, b, o = J.T @ (w[:, None] * J), J.T @ (w * above), J.T @ w
@@ -107,25 +109,27 @@ class Footing:
 
     def _facing(self, view: int, down: Float[Array, "3"]) -> tuple[Float[Array, "p 3"], Bool[Array, " p"]]:
         """A view's points (camera axes), and which of them face against a direction and the camera."""
-        first, count = int(self.store.table[view, k.FIRST]), int(self.store.table[view, k.COUNT])
+        first, count = int(self.store.table[view, lay.FIRST]), int(self.store.table[view, lay.COUNT])
         samples = self.store.samples[first : first + count].astype(np.float64)
         points, normals = samples[:, :3], samples[:, 3:6]
         towards = -np.einsum("pj,pj->p", points, normals) / np.linalg.norm(points, axis=1)
         return points, (normals @ down < -self.config.facing) & (towards > self.config.seen)
 
 
-def footing(store: ViewStore, poses: Float[Array, "n 4 4"], views: Int[Array, " m"], config: FootingConfig) -> Footing:
+def support_plane(
+    store: ViewStore, poses: Float[Array, "n 4 4"], views: Int[Array, " m"], config: SupportPlaneConfig
+) -> SupportPlane:
     """Of a toss's views in the order of time, at poses `camera_from_object`: where the body stands on the table."""
     stand, planes = np.full(len(store), -1), np.full((len(store), 4), np.nan)
     for number, run in enumerate(_still_runs(poses, [int(i) for i in views], config)):
         plane = _stood_on(store, run[0], config)
         if plane is not None:
             stand[run], planes[run] = number, plane
-    return Footing(store, views, stand, planes, config)
+    return SupportPlane(store, views, stand, planes, config)
 
 
-def _still_runs(poses: Float[Array, "n 4 4"], views: list[int], config: FootingConfig) -> list[list[int]]:
-    """Views in a row, each as near to the first as a body that does not move: told by the poses of a finished track,
+def _still_runs(poses: Float[Array, "n 4 4"], views: list[int], config: SupportPlaneConfig) -> list[list[int]]:
+    """Views in a row, each as near to the first as a body that does not move: found by the poses of a finished track,
     because the masks of a body at rest flicker more than `ViewStore.stands_still` allows."""
     runs: list[list[int]] = [[]]
     for i in views:
@@ -135,12 +139,12 @@ def _still_runs(poses: Float[Array, "n 4 4"], views: list[int], config: FootingC
     return [run for run in runs if len(run) >= config.least_still]
 
 
-def _same_place(one: Float[Array, "4 4"], two: Float[Array, "4 4"], config: FootingConfig) -> bool:
+def _same_place(one: Float[Array, "4 4"], two: Float[Array, "4 4"], config: SupportPlaneConfig) -> bool:
     turn = float(np.linalg.norm(turn_between(one, two)))
     return turn < config.still_rad and float(np.linalg.norm(one[:3, 3] - two[:3, 3])) < config.still_m
 
 
-def _stood_on(store: ViewStore, view: int, config: FootingConfig) -> Float[Array, "4"] | None:
+def _stood_on(store: ViewStore, view: int, config: SupportPlaneConfig) -> Float[Array, "4"] | None:
     """The table's plane, if the body reaches down to it."""
     crop, plane = store.crops[view], table_of(store, view)
     if crop is None or plane is None or crop.height_m is None:

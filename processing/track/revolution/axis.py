@@ -8,17 +8,18 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray as Array
 
-from processing.track import kernels as k
+from processing.sensor import view_layout as lay
 from processing.track.beam import Scene
 from recordings.geometry import rotation_exp
+from recordings.robust import geman_mcclure_weight
 
 
 @dataclass(frozen=True)
 class AxisConfig:
-    """When a body may be round; whether it is, its outlines say (profile.py)."""
+    """When a body may be round; whether it is, its outlines decide (profile.py)."""
 
     round_ratio: float = 0.2
-    """A turn about which depth tells less than this share of what it tells about the next is open ..."""
+    """A rotation about which depth carries less than this share of the information of the next one is open ..."""
     round_share: float = 0.45
     """... where so many normals meet the axis ..."""
     round_cells: int = 10
@@ -36,7 +37,7 @@ class Axis:
     direction: Float[Array, "3"]
     point_m: Float[Array, "3"]
 
-    def turn(self, angle_rad: float) -> Float[Array, "4 4"]:
+    def rotation(self, angle_rad: float) -> Float[Array, "4 4"]:
         """Object points turned about the line."""
         out = np.eye(4)
         out[:3, :3] = rotation_exp(self.direction * angle_rad)
@@ -55,29 +56,30 @@ class Axis:
 
 
 def open_axis(scene: Scene, poses: Float[Array, "n 4 4"], use: Bool[Array, " n"], config: AxisConfig) -> Axis | None:
-    """The line that the normals of all frames meet but for a handle's (Pottmann and Wallner 2001, robustly); None
-    where they leave no turn open.
+    """The line that the normals of all frames meet but for a handle's (Pottmann and Wallner 2001, robustly); None where
+    they leave no rotation open.
 
-    Minimises over twists (v, d), |d| = 1, the sum of (n . v + (p x n) . d)^2: what a turn moves points along normals.
+    Minimises over twists (v, d), |d| = 1, the sum of (n . v + (p x n) . d)^2: how far a rotation moves points along
+    normals.
     """
     points, normals = _surface(scene, poses, use, config)
-    middle = np.median(points, axis=0)
-    size = float(np.median(np.linalg.norm(points - middle, axis=1)))
-    lever = np.concatenate([normals, np.cross((points - middle) / size, normals)], axis=1)
+    center = np.median(points, axis=0)
+    size = float(np.median(np.linalg.norm(points - center, axis=1)))
+    lever = np.concatenate([normals, np.cross((points - center) / size, normals)], axis=1)
     weight = np.ones(len(points))
     for _ in range(15):
         M = (lever * weight[:, None]).T @ lever
         shift_of = np.linalg.solve(M[:3, :3] + 1e-9 * np.trace(M) * np.eye(3), M[:3, 3:])
-        told, ways = np.linalg.eigh(M[3:, 3:] - M[3:, :3] @ shift_of)
-        direction = ways[:, 0]
+        eigenvalues, eigenvectors = np.linalg.eigh(M[3:, 3:] - M[3:, :3] @ shift_of)
+        direction = eigenvectors[:, 0]
         shift = -shift_of @ direction
         gap = lever @ np.concatenate([shift, direction])
-        weight = 1.0 / (1.0 + (gap / config.meets) ** 2) ** 2
+        weight = geman_mcclure_weight((gap / config.meets) ** 2)
     meeting = np.abs(gap) < 2 * config.meets
     share, cells = float(meeting.mean()), _directions_around(normals[meeting], direction)
-    if told[0] > config.round_ratio * told[1] or share < config.round_share or cells < config.round_cells:
+    if eigenvalues[0] > config.round_ratio * eigenvalues[1] or share < config.round_share or cells < config.round_cells:
         return None
-    return Axis(direction, _foot(middle + size * np.cross(direction, shift), direction))
+    return Axis(direction, _foot(center + size * np.cross(direction, shift), direction))
 
 
 def _directions_around(normals: Float[Array, "m 3"], direction: Float[Array, "3"], cells: int = 36) -> int:
@@ -100,9 +102,9 @@ def _surface(
     """Points and normals that face their camera well, object frame."""
     points, normals = [], []
     for i in np.flatnonzero(use):
-        first, count = int(scene.store.table[i, k.FIRST]), int(scene.store.table[i, k.COUNT])
+        first, count = int(scene.store.table[i, lay.FIRST]), int(scene.store.table[i, lay.COUNT])
         seen = scene.store.samples[first : first + count : 5].astype(np.float64)
-        p, n = seen[:, :3], seen[:, k.SNX : k.SNZ + 1]
+        p, n = seen[:, :3], seen[:, lay.SNX : lay.SNZ + 1]
         facing = -np.sum(p * n, 1) / np.linalg.norm(p, axis=1)
         p, n = p[facing > config.facing], n[facing > config.facing]
         R = poses[i][:3, :3]

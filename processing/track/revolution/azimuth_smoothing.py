@@ -1,7 +1,7 @@
-"""The turns of all views at once, off the grid: where the images leave a turn open, the motion tells it.
+"""The azimuths of all views at once, off the grid: where the images leave an azimuth open, the motion fixes it.
 
 A round body's spin about its axis is constant in free flight (Euler's equations with two equal moments of inertia), so
-that what is seen before and after a stretch in which nothing tells the turn fixes that stretch too. On the table it
+that what is seen before and after a stretch in which nothing shows the azimuth fixes that stretch too. On the table it
 rolls (rolling.py).
 """
 
@@ -15,13 +15,13 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray as Array
 
 from processing.track.beam import Scene
-from processing.track.revolution.rolling import Grounded, RollConfig, Told, rolled
+from processing.track.revolution.rolling import ExpectedSteps, Grounded, RollConfig, rolled
 from recordings.geometry import rotation_log
 
 STARTING = 0.6
 """A start from rest changes the spin over its first step by half of what the same acceleration does later."""
 Terms = list[tuple[int, float, Float[Array, " v"]]]
-"""View, change of spin there (rad/s), its derivative by all views' turns."""
+"""View, change of spin there (rad/s), its derivative by all views' azimuths."""
 Normal = tuple[Float[Array, "v v"], Float[Array, " v"]]
 
 
@@ -34,11 +34,11 @@ class SteadyConfig:
     """In a hand, on the table; impacts are outliers (Cauchy)."""
     steps: int = 40
     tails: float = 3.0
-    """Those changes have heavy tails: turns err by this times what the usual ones make (28 simulated tosses)."""
+    """Those changes have heavy tails: azimuths err by this times what the usual ones make (28 simulated tosses)."""
     most: float = 4.0
     """Cells that a view turns by in one step."""
-    flight_price: float = 4.0
-    """Of a change of spin in free flight, beside one elsewhere."""
+    flight_weight: float = 4.0
+    """Weight of a change of spin in free flight, against one elsewhere."""
     flight_m_s: float = 0.15
     """A change of velocity, beyond gravity's, below this is free flight."""
     roll: RollConfig = field(default_factory=RollConfig)
@@ -51,15 +51,16 @@ class SteadyConfig:
 
 @dataclass(frozen=True, eq=False)
 class Pace:
-    """Between views: turn about the axis so far (v-1) and seconds, and what rolling on the table or a hand makes it; of
-    views: whether it stands for frames without motion, whether it flies, and the price of a change of spin there."""
+    """Between views: turn about the axis so far (v-1) and seconds, and the turns that rolling on the table or a hand
+    lets expect; of views: whether it stands for frames without motion, whether it flies, and the weight of a change of
+    spin there."""
 
     base_rad: Float[Array, " r"]
     steps_s: Float[Array, " r"]
     still: Bool[Array, " v"]
     flies: Bool[Array, " v"]
-    price: Float[Array, " v"]
-    told: Told
+    spin_weight: Float[Array, " v"]
+    expected: ExpectedSteps
 
 
 def pace_of(
@@ -75,21 +76,23 @@ def pace_of(
                      for a, b in zip(views, views[1:])])  # fmt: skip
     still = np.array([len(run) > 1 for run in runs])
     flies = np.zeros(len(runs), dtype=bool)
-    middle = axis.point_m + axis.direction * float(axis.direction @ scene.center_m)
+    center = axis.point_m + axis.direction * float(axis.direction @ scene.center_m)
     for n in range(1, len(runs) - 1):
-        x = [poses[i][:3, :3] @ middle + poses[i][:3, 3] for i in views[n - 1 : n + 2]]
+        x = [poses[i][:3, :3] @ center + poses[i][:3, 3] for i in views[n - 1 : n + 2]]
         change = (x[2] - x[1]) / steps_s[n] - (x[1] - x[0]) / steps_s[n - 1]
         change = change - 0.5 * (steps_s[n] + steps_s[n - 1]) * scene.gravity_camera_m_s2
         flies[n] = not still[n] and np.linalg.norm(change) < config.flight_m_s
-    price = np.where(flies, config.flight_price, 1.0)
-    told = _carried(scene, views, body, rolled(body, steps_s, config.roll), config)
-    return Pace(base, steps_s, still, flies, price, told)
+    spin_weight = np.where(flies, config.flight_weight, 1.0)
+    expected = _carried(scene, views, body, rolled(body, steps_s, config.roll), config)
+    return Pace(base, steps_s, still, flies, spin_weight, expected)
 
 
-def _carried(scene: Scene, views: Int[Array, " v"], body: Grounded, told: Told, config: SteadyConfig) -> Told:
+def _carried(
+    scene: Scene, views: Int[Array, " v"], body: Grounded, expected: ExpectedSteps, config: SteadyConfig
+) -> ExpectedSteps:
     """With the turns of what the robot's hand carries: where the axis moves as the hand does."""
-    turn, sigma = told.turn_rad.copy(), told.sigma_rad.copy()
-    middle = body.axis.point_m + body.rings[:, 0].mean() * body.axis.direction
+    turn, sigma = expected.step_rad.copy(), expected.sigma_rad.copy()
+    center = body.axis.point_m + body.rings[:, 0].mean() * body.axis.direction
     for n, (a, b) in enumerate(pairwise(views)):
         if (moved := scene.carried(int(a), int(b))) is None:
             continue
@@ -97,20 +100,20 @@ def _carried(scene: Scene, views: Int[Array, " v"], body: Grounded, told: Told, 
         off = (pose - body.poses[n + 1])[:3]
         if np.linalg.norm(off[:, :3] @ body.axis.direction) > config.held_rad:
             continue
-        if np.linalg.norm(off[:, :3] @ middle + off[:, 3]) < config.held_m:
+        if np.linalg.norm(off[:, :3] @ center + off[:, 3]) < config.held_m:
             turn[n] = rotation_log(pose[:3, :3].T @ body.poses[n, :3, :3]) @ body.axis.direction
             sigma[n] = config.carried_rad
-    return Told(turn, sigma)
+    return ExpectedSteps(turn, sigma)
 
 
 def steadied(
     costs: Float[Array, "m d"], pairs: Int[Array, "m 2"], standing: Normal, pace: Pace, cell_rad: float, first: int,
     config: SteadyConfig,
 ) -> tuple[Float[Array, " v"], Float[Array, " v"]]:  # fmt: skip
-    """Angles to add to each view's turn, and their standard deviations (rad); view `first` stays.
+    """Angles to add to each view's azimuth, and their standard deviations (rad); view `first` stays.
 
     costs: of each pair by the difference of its views' angles, in cells around 0 (d odd); `standing`: normal equations
-    of the same angles at 0 (`turns_of_standing`). Gauss-Newton with each curve's own slope and (if any) upward bend."""
+    of the same angles at 0 (`standing_terms`). Gauss-Newton with each curve's own slope and (if any) upward bend."""
     reach = costs.shape[1] // 2
     wide = np.pad(costs, ((0, 0), (2, 2)), mode="edge")
     smooth = sum(w * wide[:, s : s + costs.shape[1]] for s, w in enumerate((0.1, 0.2, 0.4, 0.2, 0.1)))
@@ -122,10 +125,10 @@ def steadied(
         for view, change, slope in _changes(angle, pace):
             usual = config.flight_rad_s if pace.flies[view] else config.other_rad_s
             usual *= STARTING if pace.still[view] else 1.0
-            weight = pace.price[view] / (1 + (change / (2 * usual)) ** 2) / usual**2
+            weight = pace.spin_weight[view] / (1 + (change / (2 * usual)) ** 2) / usual**2
             g += weight * change * slope
             H += weight * np.outer(slope, slope)
-        _add_told(H, g, angle, pace)
+        _add_expected(H, g, angle, pace)
         g[first], H[first], H[:, first] = 0.0, 0.0, 0.0
         H[first, first] = 1e9
         step = -np.linalg.solve(H + 1e-7 * np.diag(np.diag(H)) + 1e-6 * np.eye(len(H)), g)
@@ -159,10 +162,10 @@ def _of_pairs(
     return H, g
 
 
-def _add_told(H: Float[Array, "v v"], g: Float[Array, " v"], angle: Float[Array, " v"], pace: Pace) -> None:
-    """Adds to the normal equations the turns from view to view that are told."""
-    off = pace.base_rad - np.diff(angle) - pace.told.turn_rad
-    weight = 1 / (pace.told.sigma_rad**2 + (off / 2) ** 2)
+def _add_expected(H: Float[Array, "v v"], g: Float[Array, " v"], angle: Float[Array, " v"], pace: Pace) -> None:
+    """Adds to the normal equations the turns from view to view that are expected."""
+    off = pace.base_rad - np.diff(angle) - pace.expected.step_rad
+    weight = 1 / (pace.expected.sigma_rad**2 + (off / 2) ** 2)
     before = np.arange(len(off))
     np.add.at(g, before, weight * off)
     np.add.at(g, before + 1, -weight * off)

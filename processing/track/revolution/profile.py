@@ -15,8 +15,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 from numpy import ndarray as Array
 
+from processing.motion import se3_kernels as se3
+from processing.sensor import view_layout as lay
 from processing.sensor.view import ViewStore
-from processing.track import kernels as k
 from processing.track.beam import USUAL_DISTANCE_M
 from processing.track.revolution import profile_kernels as rk
 from processing.track.revolution.axis import Axis
@@ -127,14 +128,14 @@ class RoundBody:
         seen = self._samples(i).astype(np.float64)
         own = (seen[:, :3] - pose[:3, 3]) @ pose[:3, :3] - self.axis.point_m
         x, y, height = (own @ self._axes.T).T
-        nx, ny, along = (seen[:, k.SNX : k.SNZ + 1] @ pose[:3, :3] @ self._axes.T).T
+        nx, ny, along = (seen[:, lay.SNX : lay.SNZ + 1] @ pose[:3, :3] @ self._axes.T).T
         radius = np.maximum(np.hypot(x, y), 1e-6)
         away = (nx * x + ny * y) / radius
         sides = [away > rk.ALONG, away < -rk.ALONG, along > rk.ALONG, along < -rk.ALONG]
         return height, radius, np.select(sides, [rk.OUTSIDE, rk.INSIDE, rk.TOP, rk.FOOT], -1)
 
     def _samples(self, i: int) -> Float32[Array, "n s"]:
-        first, count = self._store.table[i, [k.FIRST, k.COUNT]]
+        first, count = self._store.table[i, [lay.FIRST, lay.COUNT]]
         return np.asarray(self._store.samples[first : first + count])
 
     def add(
@@ -162,7 +163,7 @@ class RoundBody:
         before, cross, Hyy, gy = self._before
         moved = np.zeros((len(self._views), 6))
         for n, i in enumerate(self._views):
-            gap = k.inverse(poses[i]) @ before[n]
+            gap = se3.inverse(poses[i]) @ before[n]
             moved[n] = [*gap[:3, 3], *rotation_log(gap[:3, :3])]
         step = -np.linalg.solve(Hyy, gy + np.einsum("aic,ai->c", cross, moved))
         most = np.full(len(step), 0.004)
@@ -176,19 +177,23 @@ class RoundBody:
         settings = np.array(
             [c.row_m, self._low_m, c.off_m, c.depth_m, c.outline_px, c.into_px, c.beyond_px, c.near_px, c.apart_m]
         )
-        optics, axis, profile = self._store.optics, (self._axes, self.axis.point_m), (self._y, self._seen, self._sizes)
+        rectified, axis, profile = (
+            self._store.rectified,
+            (self._axes, self.axis.point_m),
+            (self._y, self._seen, self._sizes),
+        )
         self._outline = np.zeros((views, 3))
         for n, i in enumerate(self._views):
             row, samples = self._store.table[i], self._samples(int(i))
-            scale = float(np.clip((np.median(samples[:, k.PZ]) / USUAL_DISTANCE_M) ** 2, 0.5, 4.0))
+            scale = float(np.clip((np.median(samples[:, lay.PZ]) / USUAL_DISTANCE_M) ** 2, 0.5, 4.0))
             weight = self._pixels[int(i)] / c.patch_px / len(samples)
             out = H[n], g[n], cross[n], Hyy, gy
             rk.surface_terms(samples, poses[i], *axis, *profile, settings, scale, weight, *out)
             self._outline[n] = rk.outline_terms(
                 self._beside_px,
                 row,
-                optics.focal,
-                optics.center,
+                rectified.focal,
+                rectified.center,
                 poses[i],
                 *axis,
                 *profile,
@@ -229,7 +234,7 @@ def is_round(
         H += np.diag(1e-6 * H.diagonal() + 1e-3) + 1e3 * np.trace(H) / len(H) * turn
         for i, twist in zip(views, -np.linalg.solve(H, g.reshape(-1)).reshape(-1, 6)):
             size = max(float(np.linalg.norm(twist[:3])) / 0.01, float(np.linalg.norm(twist[3:])) / 0.1, 1.0)
-            poses[i] = poses[i] @ k.inverse(k.exponential(twist / size))
+            poses[i] = poses[i] @ se3.inverse(se3.exponential(twist / size))
     return body.outline_share > config.round_share
 
 
@@ -243,15 +248,15 @@ def _beside_px(store: ViewStore, views: Int[Array, " v"]) -> Float32[Array, " p"
         beside = cv2.distanceTransform(1 - inside, cv2.DIST_L2, 5) - cv2.distanceTransform(inside, cv2.DIST_L2, 5)
         beside = cv2.GaussianBlur(np.where(inside > 0, beside + 0.5, beside - 0.5).astype(np.float32), (0, 0), 1.0)
         beside[cv2.dilate(crop.covered.astype(np.uint8), np.ones((7, 7))) > 0] = FAR_PX
-        first = int(store.table[i, k.OFFSET])
+        first = int(store.table[i, lay.OFFSET])
         out[first : first + inside.size] = beside.ravel()
     return out
 
 
 def _pixels(store: ViewStore, view: int) -> int:
     """How many of a view's pixels have depth."""
-    offset, size = int(store.table[view, k.OFFSET]), int(store.table[view, k.WIDTH] * store.table[view, k.HEIGHT])
-    return int((store.maps[offset : offset + size, k.Z] > 0).sum())
+    offset, size = int(store.table[view, lay.OFFSET]), int(store.table[view, lay.WIDTH] * store.table[view, lay.HEIGHT])
+    return int((store.maps[offset : offset + size, lay.Z] > 0).sum())
 
 
 def anchored(
@@ -259,7 +264,7 @@ def anchored(
 ) -> tuple[Float[Array, "n 4 4"], Float[Array, "n 6 6"], Axis]:
     """Poses, their covariances and the axis in the object frame in which view `first` has `pose`; that view has no
     covariance then, and the others its own beside theirs."""
-    old_from_new = k.inverse(poses[first]) @ pose
+    old_from_new = se3.inverse(poses[first]) @ pose
     spread = covariance + covariance[first]
     spread[first] = 0.0
-    return poses @ old_from_new, spread, axis.seen_from(k.inverse(old_from_new))
+    return poses @ old_from_new, spread, axis.seen_from(se3.inverse(old_from_new))

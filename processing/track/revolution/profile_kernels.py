@@ -13,7 +13,7 @@ from typing import no_type_check
 import numpy as np
 from numba import njit
 
-from processing.track.kernels import HEIGHT, OFFSET, PX, PY, PZ, SNX, SNY, SNZ, U0, V0, WIDTH
+from processing.sensor.view_layout import HEIGHT, OFFSET, PX, PY, PZ, SNX, SNY, SNZ, U0, V0, WIDTH
 
 OUTSIDE, INSIDE, TOP, FOOT = range(4)
 LOW, HIGH, BIAS, GROWN = range(-4, 0)

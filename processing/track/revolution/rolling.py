@@ -1,8 +1,8 @@
-"""What the table tells of a round body's turn about its axis: it rolls there, and nothing of it sinks in.
+"""A round body's azimuth from its contact with the table: it rolls there, and nothing of it sinks in.
 
-No image shows a mug's turn while its handle is hidden. But what lies or leans on the table touches it in a place that
-stands still (rolling without slipping: friction holds), so that the velocity of the axis and the turns across it, which
-every image shows, leave one spin about the axis. And a handle that was seen before stops on the table.
+No image shows a mug's azimuth while its handle is hidden. But what lies or leans on the table touches it in a place
+that stands still (rolling without slipping: friction holds), so that the velocity of the axis and the turns across it,
+which every image shows, leave one spin about the axis. And a handle that was seen before stops on the table.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class RollConfig:
     least_points: int = 10
     """Pixels of what stands off the body; fewer may be anything ..."""
     points: int = 40
-    """... and more than about so many tell no more."""
+    """... and more than about so many add nothing."""
     lowest: float = 0.1
     """So large a share of them may be lower than they are."""
     sunk_m: float = 0.002
@@ -46,11 +46,11 @@ class RollConfig:
 
 
 @dataclass(frozen=True, eq=False)
-class Told:
-    """From view to view: the turn about the axis that something else than the images tells, as `Pace.base_rad` counts
-    it, and its standard deviation (infinite where nothing does)."""
+class ExpectedSteps:
+    """From view to view: the turn about the axis that is expected from something else than the images, as
+    `Pace.base_rad` counts it, and its standard deviation (infinite where nothing is expected)."""
 
-    turn_rad: Float[Array, " r"]
+    step_rad: Float[Array, " r"]
     sigma_rad: Float[Array, " r"]
 
 
@@ -69,14 +69,14 @@ class Grounded:
         assert plane is not None
         up, along = plane[:3] / np.linalg.norm(plane[:3]), self.along(view)
         reach = self.rings[:, 1] * np.linalg.norm(_less(up, along))
-        return np.asarray(self.middles(view) @ plane[:3] + plane[3] - reach)
+        return np.asarray(self.ring_centers(view) @ plane[:3] + plane[3] - reach)
 
     def along(self, view: int) -> Float[Array, "3"]:
         """The axis's direction (camera axes)."""
         return np.asarray(self.poses[view, :3, :3] @ self.axis.direction)
 
-    def middles(self, view: int) -> Float[Array, "h 3"]:
-        """Middles of the rings (camera axes)."""
+    def ring_centers(self, view: int) -> Float[Array, "h 3"]:
+        """Centers of the rings (camera axes)."""
         own = self.axis.point_m + self.rings[:, :1] * self.axis.direction
         return np.asarray(own @ self.poses[view, :3, :3].T + self.poses[view, :3, 3])
 
@@ -88,8 +88,8 @@ def grounded(
     return Grounded(poses, [table_of(store, int(i)) for i in views], axis, rings)
 
 
-def rolled(body: Grounded, steps_s: Float[Array, " r"], config: RollConfig) -> Told:
-    """What the poses of consecutive views say, whatever their turns about the axis.
+def rolled(body: Grounded, steps_s: Float[Array, " r"], config: RollConfig) -> ExpectedSteps:
+    """The steps that the poses of consecutive views let expect, whatever their azimuths.
 
     The point p of the body that touches the table does not move: v + w x (p - c) = 0, where w = s a + what turns the
     axis a, gives s."""
@@ -109,20 +109,20 @@ def rolled(body: Grounded, steps_s: Float[Array, " r"], config: RollConfig) -> T
         touching = body.rings[mean < mean.min() + config.beside_m].mean(0)
         point = (touching[0] - body.rings[:, 0].mean()) * along + touching[1] * down
         arm = np.cross(along, point)
-        way = (body.middles(two) - body.middles(one)).mean(0) + np.cross(np.cross(before, after), point)
+        way = (body.ring_centers(two) - body.ring_centers(one)).mean(0) + np.cross(np.cross(before, after), point)
         turn[one] = float(way @ arm) / float(arm @ arm)
         off = max(abs(float(x.min())) for x in low)
         sigma[one] = float(np.hypot(config.slip_m, config.off_share * off) / np.linalg.norm(arm))
-    return Told(turn, sigma)
+    return ExpectedSteps(turn, sigma)
 
 
 def sunk(
-    body: Grounded, standing: list[Float32[Array, "_ s"]], pairs: Int[Array, "m 2"], turns_rad: Float[Array, " d"],
+    body: Grounded, standing: list[Float32[Array, "_ s"]], pairs: Int[Array, "m 2"], azimuths_rad: Float[Array, " d"],
     config: RollConfig,
 ) -> Float[Array, "m d"]:  # fmt: skip
     """How deep what stands off the body in one view of each pair is in the table in the other, in nats, where the first
     is turned by so much more than the second."""
-    out = np.zeros((len(pairs), len(turns_rad)))
+    out = np.zeros((len(pairs), len(azimuths_rad)))
     one, two = across(body.axis)
     parts = []
     for pose, seen in zip(body.poses, standing):
@@ -140,7 +140,7 @@ def sunk(
             foot = plane[:3] @ (turn @ body.axis.point_m + body.poses[j, :3, 3]) + plane[3]
             rise, x, y = (float(plane[:3] @ turn @ d) for d in (body.axis.direction, one, two))
             along, radius, angle = parts[i]
-            around = angle[:, None] + sign * turns_rad
+            around = angle[:, None] + sign * azimuths_rad
             height = foot + (along * rise)[:, None] + radius[:, None] * (x * np.cos(around) + y * np.sin(around))
             allowed = config.pose_share * min(low[j], 0.0) - config.sunk_m
             deep = allowed - np.quantile(height, config.lowest, axis=0)

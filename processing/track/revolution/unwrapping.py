@@ -1,8 +1,9 @@
-"""A round body's views laid out about its axis: what each shows at which height and angle, as far as a turn can tell.
+"""Cylindrical unwrapping of a round body's views about its axis: what each shows at which height and angle.
 
-Three things are kept per view. Looks of the surface, after the light on it is taken away: on a round body shading stays
-with the room, and would otherwise say that nothing turns. What stands off the round body (a mug's handle), and from
-which side it was seen. And where nothing stands off it, because something behind was seen through that place.
+Three things are kept per view. The appearance of the surface, after the light on it is taken away: on a round body
+shading stays with the room, and would otherwise show that nothing turns. What stands off the round body (a mug's
+handle), and from which side it was seen. And where nothing stands off it, because something behind was seen through
+that place.
 """
 
 from __future__ import annotations
@@ -13,15 +14,17 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 from numpy import ndarray as Array
 
+from processing.sensor import view_layout as lay
 from processing.sensor.view import ViewStore
-from processing.track import kernels as k
 from processing.track.beam import Scene
 from processing.track.revolution.axis import Axis
+from recordings.constants import LUMA, MAD_TO_SIGMA_SHORT
+from recordings.robust import geman_mcclure_weight
 
 
 @dataclass(frozen=True)
-class ChartConfig:
-    """How views are laid out."""
+class UnwrappingConfig:
+    """How views are unwrapped."""
 
     row_m: float = 0.005
     """Height of a row (radius on the ends of the body)."""
@@ -34,9 +37,9 @@ class ChartConfig:
     beside_px: float = 4.5
     """... or where the outline passes it by this."""
     facing: float = 0.25
-    """Looks of a surface that turns away from the camera farther than this cosine are not used."""
+    """The appearance of a surface that turns away from the camera farther than this cosine is not used."""
     lit_every: int = 5
-    """Of the pixels, one in so many tells what the light does."""
+    """Of the pixels, one in so many is used to fit the light."""
     robust: float = 1.5
     """Residuals of the light beyond so many standard deviations belong to the object."""
     shine: float = 0.2
@@ -48,14 +51,14 @@ class ChartConfig:
 
 
 @dataclass(frozen=True, eq=False)
-class Charts:
-    """`looks` (v, r, c, 2): two differences of colour without the light, mean per cell; `count` (v, r, c): pixels.
+class Unwrapped:
+    """`appearance` (v, r, c, 2): two differences of colour without the light, mean per cell; `count` (v, r, c): pixels.
     `odd` (v, q, c): share of cells where something stands off the body, `sides` (v, 3, q, c) the same by the side that
     was seen; `free` (v, q, c): 1 where nothing stands. Rows r: outside by height, both ends by radius; q: layers times
     heights; c: angles about the axis. `standing`: per view the pixels of what stands off the body, as samples. `rings`:
     place along the axis and radius of the round body's circles, its ends' included."""
 
-    looks: Float[Array, "v r c 2"]
+    appearance: Float[Array, "v r c 2"]
     count: Float[Array, "v r c"]
     odd: Float[Array, "v q c"]
     sides: Float[Array, "v 3 q c"]
@@ -76,18 +79,23 @@ class _Pixels:
     normal: Float[Array, "p 3"]
     facing: Float[Array, " p"]
     normal_camera: Float[Array, "p 3"]
-    looks: Float[Array, "p 2"]
+    appearance: Float[Array, "p 2"]
     bright: Float[Array, " p"]
     height_m: Float[Array, " p"]
     samples: Float32[Array, "p s"]
 
 
-def charts_of(
-    scene: Scene, poses: Float[Array, "n 4 4"], views: Int[Array, " v"], axis: Axis, cells: int, config: ChartConfig
-) -> Charts:
-    """The views laid out about the axis in so many cells of angle."""
+def unwrap(
+    scene: Scene,
+    poses: Float[Array, "n 4 4"],
+    views: Int[Array, " v"],
+    axis: Axis,
+    cells: int,
+    config: UnwrappingConfig,
+) -> Unwrapped:
+    """The views unwrapped about the axis in so many cells of angle."""
     seen = [_pixels(scene, int(i), poses[i], axis) for i in views]
-    looks = _without_light(seen, config)
+    appearance = _without_light(seen, config)
     along = np.concatenate([p.along_m for p in seen])
     low, high = np.quantile(along, [0.002, 0.998])
     profile = _profile(seen, low, high, config)
@@ -100,7 +108,7 @@ def charts_of(
     for n, (i, p) in enumerate(zip(views, seen)):
         cell = np.floor((p.angle + np.pi) / (2 * np.pi) * cells).astype(int) % cells
         row = _rows(p, profile, low, high, ends, config)
-        left, shines = looks[n]
+        left, shines = appearance[n]
         use = (row >= 0) & ~shines
         np.add.at(count[n], (row[use], cell[use]), 1)
         np.add.at(mean[n], (row[use], cell[use]), left[use])
@@ -112,7 +120,7 @@ def charts_of(
     anyhow = np.minimum(odd.sum(1), 3) / 3
     rings = np.column_stack([np.clip(low + (np.arange(heights) + 0.5) * config.row_m, low, high), profile])
     rings = np.concatenate([[[low, profile[0]]], rings, [[high, profile[-1]]]])
-    return Charts(mean, count, anyhow, np.minimum(odd, 3) / 3, free * (anyhow == 0), standing, rings)
+    return Unwrapped(mean, count, anyhow, np.minimum(odd, 3) / 3, free * (anyhow == 0), standing, rings)
 
 
 def across(axis: Axis) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
@@ -124,13 +132,13 @@ def across(axis: Axis) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
 
 def _pixels(scene: Scene, view: int, pose: Float[Array, "4 4"], axis: Axis) -> _Pixels:
     store, crop = scene.store, scene.store.crops[view]
-    offset, u0, v0, w, h = (int(x) for x in store.table[view, : k.HEIGHT + 1])
+    offset, u0, v0, w, h = (int(x) for x in store.table[view, : lay.HEIGHT + 1])
     pixels = store.maps[offset : offset + w * h].reshape(h, w, -1)
-    v, u = np.nonzero((pixels[..., k.Z] > 0) & (pixels[..., k.SHARP] < 0.5 * k.NO_LOOK))
+    v, u = np.nonzero((pixels[..., lay.Z] > 0) & (pixels[..., lay.SHARP] < 0.5 * lay.NO_APPEARANCE))
     here = pixels[v, u].astype(np.float64)
-    focal, center = store.optics.focal, store.optics.center
+    focal, center = store.rectified.focal, store.rectified.center
     rays = np.stack([(u + u0 - center[0]) / focal[0], (v + v0 - center[1]) / focal[1], np.ones(len(u))], -1)
-    p, normal = rays * here[:, k.Z, None], here[:, k.NX : k.NZ + 1]
+    p, normal = rays * here[:, lay.Z, None], here[:, lay.NX : lay.NZ + 1]
     own, turned = (p - pose[:3, 3]) @ pose[:3, :3] - axis.point_m, normal @ pose[:3, :3]
     one, two = across(axis)
     x, y = own @ one, own @ two
@@ -139,11 +147,13 @@ def _pixels(scene: Scene, view: int, pose: Float[Array, "4 4"], axis: Axis) -> _
     parts = np.stack([turned @ axis.direction, (nx * x + ny * y) / radius, (ny * x - nx * y) / radius], -1)
     facing = -np.sum(p * normal, 1) / np.linalg.norm(p, axis=1)
     assert crop is not None  # a view with pixels has a crop
-    bright = np.log(crop.color[v, u].astype(np.float64) @ [0.299, 0.587, 0.114] + 0.02)
-    looks = here[:, k.SHARP + 1 : k.SHARP + 3]
+    bright = np.log(crop.color[v, u].astype(np.float64) @ LUMA + 0.02)
+    appearance = here[:, lay.SHARP + 1 : lay.SHARP + 3]
     above = np.full(len(u), np.inf) if crop.height_m is None else crop.height_m[v, u].astype(np.float64)
-    samples = np.concatenate([p, here[:, k.NX : k.NZ + 1], here[:, k.SHARP :]], axis=1).astype(np.float32)
-    return _Pixels(own @ axis.direction, radius, np.arctan2(y, x), parts, facing, normal, looks, bright, above, samples)
+    samples = np.concatenate([p, here[:, lay.NX : lay.NZ + 1], here[:, lay.SHARP :]], axis=1).astype(np.float32)
+    return _Pixels(
+        own @ axis.direction, radius, np.arctan2(y, x), parts, facing, normal, appearance, bright, above, samples
+    )
 
 
 def _light(normal: Float[Array, "p 3"], bright: Float[Array, " p"]) -> Float[Array, "p t"]:
@@ -156,7 +166,9 @@ def _light(normal: Float[Array, "p 3"], bright: Float[Array, " p"]) -> Float[Arr
     return np.stack([*first, *third, z * (5 * z * z - 3), bright], -1)
 
 
-def _without_light(seen: list[_Pixels], config: ChartConfig) -> list[tuple[Float[Array, "p 2"], Bool[Array, " p"]]]:
+def _without_light(
+    seen: list[_Pixels], config: UnwrappingConfig
+) -> list[tuple[Float[Array, "p 2"], Bool[Array, " p"]]]:
     """Colours less what the light does to them, fitted robustly over all views (camera and room stand still), and where
     a lamp is mirrored."""
     some = [np.flatnonzero(p.facing > config.facing)[:: config.lit_every] for p in seen]
@@ -164,11 +176,11 @@ def _without_light(seen: list[_Pixels], config: ChartConfig) -> list[tuple[Float
     bright = np.concatenate([p.bright[g] for p, g in zip(seen, some)])
     terms = _light(normal, bright - bright.mean())
     stiff = 2e-5 * len(terms) * np.diag([0.0] + [1.0] * (terms.shape[1] - 1))
-    out = [np.column_stack([p.looks, p.bright - bright.mean()]) for p in seen]
+    out = [np.column_stack([p.appearance, p.bright - bright.mean()]) for p in seen]
     terms_of = [_light(p.normal_camera, p.bright - bright.mean()) for p in seen]
     for c in range(3):
         wanted = np.concatenate([o[g, c] for o, g in zip(out, some)])
-        if c == 2:  # brightness is not told by itself
+        if c == 2:  # brightness is not explained by itself
             terms = terms[:, :-1]
             stiff = stiff[:-1, :-1]
         weight = np.ones(len(terms))
@@ -176,15 +188,15 @@ def _without_light(seen: list[_Pixels], config: ChartConfig) -> list[tuple[Float
             weighed = terms * weight[:, None]
             of_light = np.linalg.solve(weighed.T @ terms + stiff, weighed.T @ wanted)
             left = wanted - terms @ of_light
-            scale = config.robust * 1.48 * np.median(np.abs(left)) + 1e-6
-            weight = 1.0 / (1.0 + (left / scale) ** 2) ** 2
+            scale = config.robust * MAD_TO_SIGMA_SHORT * np.median(np.abs(left)) + 1e-6
+            weight = geman_mcclure_weight((left / scale) ** 2)
         for o, t in zip(out, terms_of):
             o[:, c] -= t[:, : terms.shape[1]] @ of_light
-    usual = np.median(np.concatenate([p.looks[g] for p, g in zip(seen, some)]), axis=0)
+    usual = np.median(np.concatenate([p.appearance[g] for p, g in zip(seen, some)]), axis=0)
     return [(o[:, :2], _shines(o, usual, config)) for o in out]
 
 
-def _shines(left: Float[Array, "p 3"], usual: Float[Array, "2"], config: ChartConfig) -> Bool[Array, " p"]:
+def _shines(left: Float[Array, "p 3"], usual: Float[Array, "2"], config: UnwrappingConfig) -> Bool[Array, " p"]:
     """Where a lamp is mirrored: brighter than the light makes it, and its colour on the way to the lamp's (grey), but
     not beyond it: a label may be of the opposite colour."""
     size = np.linalg.norm(left[:, :2], axis=1) * np.linalg.norm(usual) + 1e-9
@@ -193,7 +205,7 @@ def _shines(left: Float[Array, "p 3"], usual: Float[Array, "2"], config: ChartCo
     return np.asarray((left[:, 2] > config.shine) & on_the_way)
 
 
-def _profile(seen: list[_Pixels], low: float, high: float, config: ChartConfig) -> Float[Array, " h"]:
+def _profile(seen: list[_Pixels], low: float, high: float, config: UnwrappingConfig) -> Float[Array, " h"]:
     """Radius of the round body at each height: the median of what faces away from the axis."""
     heights = int(np.ceil((high - low) / config.row_m)) + 1
     outside = [(p.normal[:, 1] > 0.8) & (np.abs(p.normal[:, 0]) < 0.5) for p in seen]
@@ -208,7 +220,7 @@ def _profile(seen: list[_Pixels], low: float, high: float, config: ChartConfig) 
 
 
 def _rows(
-    p: _Pixels, profile: Float[Array, " h"], low: float, high: float, ends: int, config: ChartConfig
+    p: _Pixels, profile: Float[Array, " h"], low: float, high: float, ends: int, config: UnwrappingConfig
 ) -> Int[Array, " p"]:
     """Row of each pixel of the round body's outside and ends; -1 elsewhere: hollows are lit by themselves."""
     height = np.floor((p.along_m - low) / config.row_m).astype(int)
@@ -225,7 +237,7 @@ def _rows(
 
 
 def _off(
-    p: _Pixels, profile: Float[Array, " h"], low: float, config: ChartConfig
+    p: _Pixels, profile: Float[Array, " h"], low: float, config: UnwrappingConfig
 ) -> tuple[Int[Array, " p"], Int[Array, " p"], Int[Array, " p"], Bool[Array, " p"]]:
     """Height, layer and seen side (0, 1, 2) of each pixel, and whether it stands off the round body."""
     height = np.floor((p.along_m - low) / config.row_m).astype(int)
@@ -242,11 +254,11 @@ def _off(
 
 def _free(
     scene: Scene, view: int, pose: Float[Array, "4 4"], axis: Axis, profile: Float[Array, " h"], low: float, cells: int,
-    config: ChartConfig,
+    config: UnwrappingConfig,
 ) -> Bool[Array, "q c"]:  # fmt: skip
     """Where the view saw past or through a place above the round body."""
     store = scene.store
-    offset, u0, v0, w, h = (int(x) for x in store.table[view, : k.HEIGHT + 1])
+    offset, u0, v0, w, h = (int(x) for x in store.table[view, : lay.HEIGHT + 1])
     pixels = store.maps[offset : offset + w * h].reshape(h, w, -1)
     angle = (np.arange(cells) + 0.5) / cells * 2 * np.pi - np.pi
     one, two = across(axis)
@@ -255,12 +267,14 @@ def _free(
     radius = np.concatenate([profile + layer for layer in config.layers_m])
     places = np.tile(along, (len(config.layers_m), 1))[:, None] + radius[:, None, None] * outward
     q = places @ pose[:3, :3].T + pose[:3, 3]
-    u = np.round(q[..., 0] / q[..., 2] * store.optics.focal[0] + store.optics.center[0] - u0).astype(int)
-    v = np.round(q[..., 1] / q[..., 2] * store.optics.focal[1] + store.optics.center[1] - v0).astype(int)
+    u = np.round(q[..., 0] / q[..., 2] * store.rectified.focal[0] + store.rectified.center[0] - u0).astype(int)
+    v = np.round(q[..., 1] / q[..., 2] * store.rectified.focal[1] + store.rectified.center[1] - v0).astype(int)
     shown = (u >= 0) & (v >= 0) & (u < w) & (v < h)
     there = pixels[np.clip(v, 0, h - 1), np.clip(u, 0, w - 1)]
-    through = (there[..., k.OUTSIDE] == 0) & (there[..., k.Z] > 0) & (there[..., k.Z] - q[..., 2] > config.beyond_m)
-    beside = ~shown | (there[..., k.OUTSIDE] > config.beside_px)
+    through = (
+        (there[..., lay.OUTSIDE] == 0) & (there[..., lay.Z] > 0) & (there[..., lay.Z] - q[..., 2] > config.beyond_m)
+    )
+    beside = ~shown | (there[..., lay.OUTSIDE] > config.beside_px)
     return np.asarray(beside | through | (_heights(store, view, q) < -config.table_m))
 
 
@@ -280,7 +294,7 @@ def table_of(store: ViewStore, view: int) -> Float[Array, "4"] | None:
     v, u = np.nonzero(crop.depth_m > 0)
     some = slice(None, None, max(len(u) // 200, 1))
     u, v = u[some], v[some]
-    focal, center = store.optics.focal, store.optics.center
+    focal, center = store.rectified.focal, store.rectified.center
     rays = np.stack([(u + crop.corner[0] - center[0]) / focal[0], (v + crop.corner[1] - center[1]) / focal[1]], -1)
     z = crop.depth_m[v, u].astype(np.float64)
     seen = np.column_stack([rays * z[:, None], z, np.ones(len(z))])

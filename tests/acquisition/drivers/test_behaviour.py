@@ -111,7 +111,8 @@ def ur(ask: Callable[[str], Any]) -> Iterator[Backend]:
 @contextmanager
 def synthetic(name: str, kind: str, protocol: Any, rate_hz: float = 30.0) -> Iterator[Backend]:
     """A device of the simulated lab, showing ready-made pictures."""
-    from acquisition.drivers.synthetic import SyntheticConfig, SyntheticLab, SyntheticThrower
+    from acquisition.drivers.synthetic import SyntheticLab, SyntheticThrower
+    from acquisition.synthetic.lab_config import SyntheticConfig
     from recordings.progress import Silent
 
     lab = SyntheticLab(SyntheticConfig(pictures="pool", color_size=(64, 48), mono_size=(64, 48)))

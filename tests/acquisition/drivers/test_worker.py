@@ -14,7 +14,7 @@ from acquisition.drivers.workers.process import Worker
 
 CHILD = """
 import sys, time
-from acquisition.drivers.worker import WorkerEnd
+from acquisition.drivers.workers.process import WorkerEnd
 
 end = WorkerEnd()
 print("what a vendor's library prints")

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 import torch
 
-from processing.contact.command import PoseSource, chosen, contact_only, find_poses, in_frame_of
 from processing.contact.physics.geometry import CORNERS
+from processing.contact_command import chosen, contact_only
 from processing.motion.trajectory import rotation_matrices
+from processing.pose_source import PoseSource, find_poses, in_frame_of
 from recordings.errors import BadInput
 from recordings.geometry import Transform
 from recordings.records import StampedPose

@@ -10,10 +10,10 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from processing.field.fuse import FuseConfig, fuse
-from processing.field.learn import pose_at
 from processing.field.mesh import extract_mesh, grid_mesh
 from processing.field.train import FieldConfig, train_field
 from processing.field.views import FieldView, make_view, object_points
+from processing.motion.interpolate import pose_at
 from recordings.errors import BadInput
 from recordings.geometry import CameraModel
 from recordings.records import RgbdFrame

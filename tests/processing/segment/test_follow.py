@@ -51,9 +51,9 @@ def test_late_depth_is_put_where_colour_shows_the_body() -> None:
     color, depth = frame((np.s_[40:70, 50:80], RED, 0.7)), frame((np.s_[44:74, 57:87], RED, 0.7))
     late = replace(color, depth_m=depth.depth_m, depth_time_ns=16_000_000)
     body = depth.depth_m < 0.9
-    foretold = way_px(late, np.array([375.0, 312.5]))  # px/s: 6 and 5 px in 16 ms, where 7 and 4 is right
-    np.testing.assert_allclose(foretold, [-6, -5])
-    found = at_color_time(late, empty_scene(), body, foretold, LateDepthSettings(), ForegroundSettings())
+    predicted = way_px(late, np.array([375.0, 312.5]))  # px/s: 6 and 5 px in 16 ms, where 7 and 4 is right
+    np.testing.assert_allclose(predicted, [-6, -5])
+    found = at_color_time(late, empty_scene(), body, predicted, LateDepthSettings(), ForegroundSettings())
     np.testing.assert_array_equal(found.depth_m, color.depth_m)
 
 
@@ -61,8 +61,10 @@ def test_late_depth_is_not_put_on_the_bodys_shadow() -> None:
     shadow = (np.s_[60:90, 46:80], (70, 70, 70), 1.0)
     color, depth = frame(shadow, (np.s_[40:70, 50:80], RED, 0.7)), frame((np.s_[44:74, 53:83], RED, 0.7))
     late = replace(color, depth_m=depth.depth_m, depth_time_ns=16_000_000)
-    foretold = np.array([-3.0, -1.0])  # there it would cover nothing but itself and its shadow
-    found = at_color_time(late, empty_scene(), depth.depth_m < 0.9, foretold, LateDepthSettings(), ForegroundSettings())
+    predicted = np.array([-3.0, -1.0])  # there it would cover nothing but itself and its shadow
+    found = at_color_time(
+        late, empty_scene(), depth.depth_m < 0.9, predicted, LateDepthSettings(), ForegroundSettings()
+    )
     np.testing.assert_array_equal(found.depth_m, color.depth_m)
 
 

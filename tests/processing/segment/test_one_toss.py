@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from processing.config import Config
-from processing.pipeline import Run, start_run
+from processing.run import Run
 from processing.segment.background.follow import BackgroundSettings
 from processing.segment.background.moving_camera import why_other_scene
 from processing.segment.background.segmenter import BackgroundSegmenter
@@ -22,7 +22,11 @@ from processing.segment.background.static_scene import (
     learn_scene,
     seen_table_depth,
 )
-from processing.stages.masks import object_masks, scene_notes, static_scene
+from processing.stages.find import find_object
+from processing.stages.rig import refine_rig
+from processing.stages.scene import learn_static_scene, scene_notes
+from processing.stages.segment import segment
+from processing.start import start_run
 from recordings.errors import DamagedFile
 from recordings.geometry import rotation_exp
 from recordings.progress import Silent
@@ -107,46 +111,48 @@ def _run(session: Path, tosses: list[int], out: Path) -> Run:
 def test_one_toss_has_the_same_scene_and_masks_as_among_the_others(record_tiny: Record, tmp_path: Path) -> None:
     session = record_tiny(tosses=(0, 1, 2))
     alone, among = _run(session, [1], tmp_path / "alone"), _run(session, [0, 1, 2], tmp_path / "among")
-    scenes = [static_scene(r) for r in (alone, among)]
+    scenes = [learn_static_scene(r) for r in (alone, among)]
     one, all_of_them = (StaticScene.read(s.folder) for s in scenes)
     np.testing.assert_array_equal(one.depth_m, all_of_them.depth_m)
     np.testing.assert_array_equal(one.color_rgb, all_of_them.color_rgb)
-    masks = [read_masks(object_masks(r, 1, s).folder, 1) for r, s in zip((alone, among), scenes)]
+    rigs = [refine_rig(r, s) for r, s in zip((alone, among), scenes)]
+    found = [find_object(r, s, g) for r, s, g in zip((alone, among), scenes, rigs)]
+    masks = [read_masks(segment(r, 1, s, g, f).folder, 1) for r, s, g, f in zip((alone, among), scenes, rigs, found)]
     assert all((a == b).all() for a, b in zip(*masks))
-    assert scenes[0].counts["tosses"] == [0, 1, 2]
-    assert scene_notes(alone) == ()
+    assert scenes[0].result.tosses == (0, 1, 2)
+    assert scene_notes(scenes[0]) == ()
 
 
 def test_a_damaged_toss_beside_is_left_out_and_said_and_one_of_the_run_ends_it(
     record_tiny: Record, tmp_path: Path
 ) -> None:
     session = record_tiny(tosses=(0, 1, 2))
-    whole = static_scene(_run(session, [0], tmp_path / "out"))
+    whole = learn_static_scene(_run(session, [0], tmp_path / "out"))
     file = session / "toss_02.mcap"
     file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
     run = _run(session, [0], tmp_path / "out")
-    damaged = static_scene(run)
+    damaged = learn_static_scene(run)
     assert damaged.key != whole.key  # what was read has changed
-    assert damaged.counts["tosses"] == [0, 1]
-    assert scene_notes(run)[0].startswith("toss 2 gives no frames of the background: it cannot be read")
-    assert static_scene(run).reused
+    assert damaged.result.tosses == (0, 1)
+    assert scene_notes(damaged)[0].startswith("toss 2 gives no frames of the background: it cannot be read")
+    assert learn_static_scene(run).reused
     with pytest.raises(DamagedFile):
-        static_scene(_run(session, [2], tmp_path / "out"))
+        learn_static_scene(_run(session, [2], tmp_path / "out"))
     file.unlink()
-    assert static_scene(_run(session, [0], tmp_path / "out")).key not in (whole.key, damaged.key)
+    assert learn_static_scene(_run(session, [0], tmp_path / "out")).key not in (whole.key, damaged.key)
 
 
 def test_a_toss_beside_of_another_scene_is_left_out(tiny_world: Any, record_tiny: Record, tmp_path: Path) -> None:
     session = record_tiny(tosses=(0, 1))
-    clean = StaticScene.read(static_scene(_run(session, [0], tmp_path / "clean")).folder)
+    clean = StaticScene.read(learn_static_scene(_run(session, [0], tmp_path / "clean")).folder)
     higher = replace(tiny_world, world_from_camera=replace(
         tiny_world.world_from_camera, translation_m=np.array([0.0, -0.2, 0.8])))  # fmt: skip
     other = higher.record(tmp_path / "bumped", tosses=(0, 1), frames=8)
     (session / "toss_01.mcap").write_bytes((other / "toss_01.mcap").read_bytes())
     run = _run(session, [0], tmp_path / "out")
-    done = static_scene(run)
-    assert done.counts["tosses"] == [0]
-    assert len(scene_notes(run)) == 1
+    done = learn_static_scene(run)
+    assert done.result.tosses == (0,)
+    assert len(scene_notes(done)) == 1
     np.testing.assert_allclose(StaticScene.read(done.folder).depth_m, clean.depth_m, atol=0.004)
 
 
@@ -154,6 +160,6 @@ def test_of_many_tosses_only_some_are_looked_at(record_tiny: Record, tmp_path: P
     session = record_tiny(tosses=tuple(range(6)), frames=4)
     settings = Config(scene=SceneSettings(frames=12))
     run = replace(_run(session, [2], tmp_path / "out"), config=settings)
-    counts = static_scene(run).counts
-    assert counts["tosses"] == [0, 2, 5]
-    assert counts["frames"] <= 12
+    found = learn_static_scene(run).result
+    assert found.tosses == (0, 2, 5)
+    assert found.frames <= 12

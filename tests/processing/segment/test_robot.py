@@ -13,15 +13,18 @@ import cv2
 import numpy as np
 import pytest
 
-from processing.pipeline import start_run
-from processing.segment.background.depth_scale import DepthScaleSettings, believed, corrected_depth, table_scale
+from processing.segment.background.depth_scale import DepthScaleSettings, accepted_scale, table_scale
 from processing.segment.background.static_scene import StaticScene, calibrated_table_depth
 from processing.segment.robot.fit import RobotFitSettings, Sight, choose_sights, edge_offsets, fit_robot
 from processing.segment.robot.frames import RobotFrames, RobotSettings, with_robot
+from processing.segment.robot.of_session import Rig, RobotOfSession
 from processing.segment.robot.render import RobotView
-from processing.sensor.frames import with_depth_scale
-from processing.stages.masks import object_masks, static_scene
-from processing.stages.rig import Rig, RobotOfSession, rig_stage
+from processing.sensor.frames import corrected_depth, metric_frames
+from processing.stages.find import find_object
+from processing.stages.rig import refine_rig
+from processing.stages.scene import learn_static_scene
+from processing.stages.segment import segment
+from processing.start import start_run
 from recordings.geometry import CameraModel, Transform, rotation_exp, rotation_log
 from recordings.progress import Silent
 from recordings.records import ArmStates, RgbdFrame
@@ -224,16 +227,16 @@ def test_the_table_tells_the_depth_scale(tiny_world: Any) -> None:
     found = table_scale(scene, tiny_world.camera, world_from_camera, DepthScaleSettings())
     assert found is not None
     assert found.scale == pytest.approx(1.01, abs=3e-4)
-    assert believed(found.scale, found.sigma, DepthScaleSettings()) == found.scale
-    assert believed(1.0005, found.sigma, DepthScaleSettings()) == 1.0
+    assert accepted_scale(found.scale, found.sigma, DepthScaleSettings()) == found.scale
+    assert accepted_scale(1.0005, found.sigma, DepthScaleSettings()) == 1.0
 
 
-def test_a_tilted_table_is_the_calibrations_error_and_its_scale_is_not_believed(tiny_world: Any) -> None:
+def test_a_tilted_table_is_the_calibrations_error_and_its_scale_is_not_accepted(tiny_world: Any) -> None:
     scene, world_from_camera = table_scene(tiny_world, 1.004, tilt_deg=0.3)
     found = table_scale(scene, tiny_world.camera, world_from_camera, DepthScaleSettings())
     assert found is not None
     assert found.tilt_deg == pytest.approx(0.3, abs=0.02)
-    assert believed(found.scale, found.sigma, DepthScaleSettings()) == 1.0
+    assert accepted_scale(found.scale, found.sigma, DepthScaleSettings()) == 1.0
 
 
 def test_corrected_depth_is_divided_and_no_return_stays() -> None:
@@ -242,8 +245,8 @@ def test_corrected_depth_is_divided_and_no_return_stays() -> None:
     frame = RgbdFrame("d455", 0, 0, 0, np.zeros((1, 2, 3), np.uint8), depth)
     times = np.zeros(1, np.int64)
     frames = RgbdFrames(times, lambda i: frame, times, (), 0)
-    assert with_depth_scale(frames, 1.0) is frames
-    np.testing.assert_allclose(with_depth_scale(frames, 1.004)[0].depth_m, [[0, 1]], atol=1e-6)
+    assert metric_frames(frames, 1.0) is frames
+    np.testing.assert_allclose(metric_frames(frames, 1.004)[0].depth_m, [[0, 1]], atol=1e-6)
 
 
 def test_without_joint_states_the_masks_are_as_before_and_the_counts_say_so(
@@ -253,13 +256,13 @@ def test_without_joint_states_the_masks_are_as_before_and_the_counts_say_so(
 
     with Session.open(record_tiny(tosses=(0,))) as session:
         run: Any = start_run(session, (0,), tmp_path / "results", Config(), "multi-hypothesis", lambda _: Silent())
-        scene = static_scene(run)
-        rig = rig_stage(run, scene)
-        masks = object_masks(run, 0, scene)
-    assert rig.counts["robot"] == "no joint states of a Franka Panda in these tosses"
-    assert masks.counts["robot"] == rig.counts["robot"]
+        scene = learn_static_scene(run)
+        rig = refine_rig(run, scene)
+        masks = segment(run, 0, scene, rig, find_object(run, scene, rig))
+    assert rig.result.robot == "no joint states of a Franka Panda in these tosses"
+    assert masks.result.robot == rig.result.robot
     assert Rig.read(rig.folder).camera_from_base is None
-    assert masks.counts["empty"] == 0
+    assert masks.result.empty == 0
 
 
 def test_a_recorded_robot_is_drawn_to_the_pixel(data: Callable[[str], Path]) -> None:
@@ -295,4 +298,7 @@ def test_a_missing_base_pose_and_another_arm_are_said() -> None:
 
     assert RobotOfSession(session(states())).missing((0,)) == "no base pose in the calibration"
     other = RobotOfSession(session(replace(states(), joint_names=("a",) * 7)))
-    assert other.missing((0,)) == "no joint states of a Franka Panda in these tosses"
+    assert (
+        other.missing((0,))
+        == f"no joint states of a Franka Panda in these tosses; the recorded joints are {', '.join('a' * 7)}"
+    )

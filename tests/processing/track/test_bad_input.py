@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from processing.evaluate.metrics import align_first, frame_errors
-from processing.track.flags import FlagConfig, doubt
+from processing.track.flags import FlagConfig, uncertainty
 from processing.track.track_toss import TossTrack, track_toss
 from recordings.errors import BadInput
 from recordings.geometry import Transform, rotation_exp
@@ -99,12 +99,12 @@ def test_two_objects_under_one_mask_are_not_taken_for_one_rigid_body(tiny_world:
     assert two.unfit > 0.5 * count
 
 
-def test_another_story_of_the_same_frames_is_doubt() -> None:
+def test_another_hypothesis_of_the_same_frames_adds_uncertainty() -> None:
     poses = np.tile(np.eye(4), (3, 1, 1))
     rival = poses.copy()
     rival[1, :3, :3] = rotation_exp(np.array([0.0, 0.0, 0.4]))
     rival[2] = np.nan
-    added = doubt(poses, rival, 0.0, FlagConfig())
+    added = uncertainty(poses, rival, 0.0, FlagConfig())
     assert added[1, 5, 5] == pytest.approx(0.16)
     assert np.count_nonzero(added) == 1
-    assert doubt(poses, rival, 10 * FlagConfig().rival_cost, FlagConfig())[1, 5, 5] < 0.002
+    assert uncertainty(poses, rival, 10 * FlagConfig().rival_cost, FlagConfig())[1, 5, 5] < 0.002

@@ -1,11 +1,11 @@
-"""What is said of frames that no other frame supports."""
+"""What is reported of frames that no other frame supports."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from processing.track.flags import FlagConfig, unjoined, unjoined_doubt
+from processing.track.flags import FlagConfig, unjoined, unjoined_uncertainty
 from recordings.geometry import rotation_exp
 
 GOOD, BAD = (0.03, 0.95, 0.01), (0.2, 0.9, 0.05)
@@ -41,13 +41,13 @@ def test_a_frame_in_no_pair_hangs_and_one_that_is_not_used_does_not() -> None:
     assert hanging([], [], [0]) == [1, 2, 3, 4]
 
 
-def test_the_doubt_of_a_hanging_frame_is_a_turn_about_the_middle() -> None:
+def test_the_uncertainty_of_a_hanging_frame_is_a_rotation_about_the_center_of_mass() -> None:
     center = np.array([0.02, -0.01, 0.05])
-    doubt = unjoined_doubt(np.array([False, True]), center, FlagConfig(unjoined_sigma_rad=0.5))
-    assert not doubt[0].any()
-    np.testing.assert_allclose(doubt[1, 3:, 3:], 0.25 * np.eye(3))
+    uncertainty = unjoined_uncertainty(np.array([False, True]), center, FlagConfig(unjoined_sigma_rad=0.5))
+    assert not uncertainty[0].any()
+    np.testing.assert_allclose(uncertainty[1, 3:, 3:], 0.25 * np.eye(3))
     turn = np.array([1e-5, -2e-5, 3e-5])
-    moved = center - rotation_exp(turn) @ center  # where the origin goes when the body turns about its middle
-    to_origin = doubt[1, :3, 3:] / 0.25
+    moved = center - rotation_exp(turn) @ center  # where the origin goes when the body turns about its center of mass
+    to_origin = uncertainty[1, :3, 3:] / 0.25
     np.testing.assert_allclose(to_origin @ turn, moved, atol=1e-10)
-    assert np.linalg.eigvalsh(doubt[1])[0] == pytest.approx(0, abs=1e-12)
+    assert np.linalg.eigvalsh(uncertainty[1])[0] == pytest.approx(0, abs=1e-12)

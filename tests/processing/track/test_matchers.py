@@ -16,7 +16,7 @@ from processing.features.lightglue import LightGlue, LightGlueConfig, empty_netw
 from processing.features.loftr import Grid, Loftr, LoftrConfig
 from processing.features.sift import FeatureMatcher, Features, RansacConfig, Sift, relative_motions
 from processing.features.xfeat import XFeat, XFeatConfig
-from processing.sensor.rectification import Optics
+from processing.sensor.rectification import Rectification
 from processing.sensor.view import ViewConfig, ViewStore, cut
 from processing.track.beam import Candidate
 from processing.track.notes import NotesConfig, notes_of
@@ -62,10 +62,10 @@ POSES = [pose_of([0, 0.1, 0], [0, 0, 0]), pose_of([0.1, -0.1, 0.15], [0.02, -0.0
 @pytest.fixture(scope="module")
 def store() -> ViewStore:
     """Two views of the square and one of nothing."""
-    optics, config = Optics.of(CAMERA), ViewConfig()
+    rectified, config = Rectification.of(CAMERA), ViewConfig()
     seen = [see(p) for p in POSES]
-    crops = [cut(frame, mask, i, optics, 1.0, config) for i, (frame, mask) in enumerate(seen)]
-    out = ViewStore(optics, [*crops, None], config)
+    crops = [cut(frame, mask, i, rectified, 1.0, config) for i, (frame, mask) in enumerate(seen)]
+    out = ViewStore(rectified, [*crops, None], config)
     assert [out.fill(i) for i in range(3)] == [True, True, False]
     return out
 

@@ -1,4 +1,4 @@
-"""What the table tells of a round body's turn: known motions of a cylinder."""
+"""A round body's azimuth from its contact with the table: known motions of a cylinder."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from processing.sensor.view import ViewStore
 from processing.track.beam import Scene
 from processing.track.revolution.axis import Axis
 from processing.track.revolution.azimuth_smoothing import SteadyConfig, _carried
-from processing.track.revolution.rolling import Grounded, RollConfig, Told, rolled, sunk
+from processing.track.revolution.rolling import ExpectedSteps, Grounded, RollConfig, rolled, sunk
 from recordings.geometry import rotation_exp, rotation_log
 
 RADIUS, HALF, STEP_S = 0.04, 0.05, 1 / 30
@@ -48,7 +48,7 @@ def body_foot(pose: Array) -> float:
 
 def own_turns(poses: list[Array]) -> list[Array]:
     """The poses with turns about the axis that nobody could see."""
-    return [p @ AXIS.turn(a) for p, a in zip(poses, np.random.default_rng(0).uniform(-3, 3, len(poses)))]
+    return [p @ AXIS.rotation(a) for p, a in zip(poses, np.random.default_rng(0).uniform(-3, 3, len(poses)))]
 
 
 def motion(tilt: float, spin: float, precession: float, count: int = 8, substeps: int = 200) -> list[Array]:
@@ -75,7 +75,7 @@ def test_a_cylinder_that_rolls_turns_as_far_as_its_axis_goes(tilt: float, preces
     found = rolled(beside_table(own_turns(poses)), np.full(len(poses) - 1, STEP_S), RollConfig())
     # the body's own spin about the axis: what it turns by itself and the precession's part along the axis
     wanted = -(spin + precession * np.sin(tilt)) * STEP_S
-    np.testing.assert_allclose(found.turn_rad, wanted, rtol=0.01)
+    np.testing.assert_allclose(found.step_rad, wanted, rtol=0.01)
     assert (found.sigma_rad < np.radians(3)).all()
 
 
@@ -108,16 +108,16 @@ def test_what_the_robots_hand_carries_turns_as_the_hand_does() -> None:
     held[5][:3, 3] += 0.1
     hidden = hand.copy()
     hidden[2] = np.nan
-    free = Told(np.zeros(5), np.full(5, np.inf))
+    free = ExpectedSteps(np.zeros(5), np.full(5, np.inf))
     for known, carried in ((hand, [0, 1, 2]), (hidden, [0])):
         scene = Scene(Mock(spec=ViewStore), np.arange(6) / 30, np.zeros(3), np.zeros(3), Sift(), hand=known)
         found = _carried(scene, np.arange(6), beside_table(own_turns(held)), free, SteadyConfig())
         assert np.flatnonzero(np.isfinite(found.sigma_rad)).tolist() == carried
         turned = beside_table(own_turns(held)).poses
-        for n in carried:  # the second view's turn that goes with the hand, told as its pose's error is
+        for n in carried:  # the second view's turn that goes with the hand, less its pose's error
             between = rotation_log(turned[n + 1, :3, :3].T @ (hand[n + 1] @ np.linalg.inv(hand[n]) @ turned[n])[:3, :3])
             own = rotation_log(turned[n + 1, :3, :3].T @ turned[n, :3, :3]) @ AXIS.direction
-            off = (own - found.turn_rad[n] - between @ AXIS.direction + np.pi) % (2 * np.pi) - np.pi
+            off = (own - found.step_rad[n] - between @ AXIS.direction + np.pi) % (2 * np.pi) - np.pi
             assert abs(off) < 0.05
 
 
@@ -152,7 +152,7 @@ def test_a_handle_of_either_view_counts_and_the_first_is_turned_by_more_than_the
     np.testing.assert_allclose(one, other[::-1], rtol=1e-4)
     assert (one > 1).sum() == 1
     for turn, said in zip(turns, one):  # the first view's pose turned by that much: where its handle comes to lie
-        there = AXIS.turn(-float(turn))
+        there = AXIS.rotation(-float(turn))
         height = (handle @ there[:3, :3].T + there[:3, 3]) @ pose[:3, :3].T @ body_up(pose)
         deep = -np.quantile(height + body_foot(pose), 0.1) - 0.002
         assert said == pytest.approx(0.5 * (max(deep, 0.0) / 0.002) ** 2, rel=1e-3, abs=1e-9)

@@ -13,11 +13,15 @@ from hypothesis import strategies as st
 
 from processing.evaluate.metrics import align_first, frame_errors
 from processing.features.sift import rigid_fit
-from processing.motion.motion_prior import MotionConfig, all_turns, change_cost, moved, steady_spin, turn_between
-from processing.sensor.rectification import Optics
+from processing.motion import se3_kernels as se3
+from processing.motion.interpolate import moved, turn_between
+from processing.motion.motion_prior import MotionConfig, change_cost, steady_spin
+from processing.motion.rotation_grid import all_turns
+from processing.sensor import view_layout as lay
+from processing.sensor.rectification import Rectification
+from processing.sensor.surface_kernel import fit_surface
 from processing.sensor.view import ViewConfig, ViewStore, cut, make_view
-from processing.track import hypotheses as story
-from processing.track import kernels as k
+from processing.track import hypotheses as trajectory
 from processing.track.center_of_mass import flight_center
 from processing.track.flags import camera_covariance
 from processing.track.joint_refinement import GraphConfig, Motion, _add_motion, refine
@@ -74,8 +78,8 @@ def test_an_impact_does_not_pull_at_the_turns_around_it_but_a_small_error_does(i
 
 @given(SMALL)
 def test_exponential_and_inverse_meet(twist: np.ndarray) -> None:
-    pose = k.exponential(twist)
-    np.testing.assert_allclose(pose @ k.inverse(pose), np.eye(4), atol=1e-9)
+    pose = se3.exponential(twist)
+    np.testing.assert_allclose(pose @ se3.inverse(pose), np.eye(4), atol=1e-9)
     np.testing.assert_allclose(pose, pose_of(twist), atol=1e-9)
 
 
@@ -87,23 +91,23 @@ def test_depth_of_a_tilted_plane_comes_back_with_its_normal() -> None:
     out, normals = np.zeros((50, 60), dtype=np.float32), np.zeros((50, 60, 3), dtype=np.float32)
     inside = np.zeros((50, 60), dtype=bool)
     inside[5:45, 5:55] = True
-    k.fit_surface(depth.astype(np.float32), inside, np.array([0.01, 0.01, -0.3, -0.25]), 3, 0.012, out, normals)
+    fit_surface(depth.astype(np.float32), inside, np.array([0.01, 0.01, -0.3, -0.25]), 3, 0.012, out, normals)
     exact = (normal @ [0, 0, 0.8]) / (camera.pixel_rays() @ normal)
     np.testing.assert_allclose(out[inside], exact[inside], atol=1e-5)  # the hole too
     np.testing.assert_allclose(normals[inside], np.broadcast_to(normal, (inside.sum(), 3)), atol=1e-3)
     assert (out[~inside] == 0).all()
 
 
-def test_free_flight_is_foretold_and_costs_nothing() -> None:
+def test_free_flight_is_predicted_and_costs_nothing() -> None:
     center, spin, gravity = np.array([0.02, -0.01, 0.03]), np.array([3.0, -5.0, 2.0]), np.array([0, 0, -9.81])
     poses, times = flight(6, center, spin)
-    foretold = moved(poses[2], poses[3], times[3] - times[2], times[4] - times[3], center, gravity)
-    np.testing.assert_allclose(foretold, poses[4], atol=1e-9)
+    predicted = moved(poses[2], poses[3], times[3] - times[2], times[4] - times[3], center, gravity)
+    np.testing.assert_allclose(predicted, poses[4], atol=1e-9)
     np.testing.assert_allclose(steady_spin(poses[:5], times[:5]), spin, atol=1e-9)
     assert change_cost((poses[2], poses[3], poses[4]), (1 / 30, 1 / 30), center, gravity, MotionConfig()) < 1e-6
 
 
-def test_an_impact_costs_no_more_than_its_price() -> None:
+def test_an_impact_costs_no_more_than_the_cost_of_an_impact() -> None:
     poses, _ = flight(3, np.zeros(3), np.array([3.0, -5.0, 2.0]))
     hit = poses[2].copy()
     hit[:3, :3] = rotation_exp(np.array([0.0, 0.4, 0.0])) @ hit[:3, :3]
@@ -199,15 +203,15 @@ def test_the_object_frame_starts_parallel_to_the_camera_in_the_cloud(toss: Any, 
 
 
 @pytest.mark.parametrize(("worse", "taken"), [(1.7, True), (2.5, False)])
-def test_a_body_that_looks_round_is_told_by_how_badly_the_profile_fits(
+def test_a_body_that_looks_round_is_recognised_by_the_cost_of_its_profile(
     tiny_world: Any, toss: Any, tracked: TossTrack, monkeypatch: pytest.MonkeyPatch, worse: float, taken: bool
 ) -> None:
     axis = Axis(np.array([0.0, 0.0, 1.0]), tracked.center_m)
 
-    def sought(_: Any, stories: list[story.Story], *__: Any) -> story.Story:
-        return replace(stories[0], badness=worse * stories[0].badness, axis=axis)
+    def sought(_: Any, hypotheses: list[trajectory.TrajectoryHypothesis], *__: Any) -> trajectory.TrajectoryHypothesis:
+        return replace(hypotheses[0], cost=worse * hypotheses[0].cost, axis=axis)
 
-    monkeypatch.setattr(story, "_sought", sought)
+    monkeypatch.setattr(trajectory, "_sought", sought)
     assert followed(tiny_world, toss).round_body == taken
 
 
@@ -272,11 +276,11 @@ def test_depth_exposed_half_a_frame_late_is_moved_to_the_color(tiny_world: Any, 
     write_toss_track(tmp_path, tracked)
     kept = read_toss_track(tmp_path, 0, frames, masks, tiny_world.camera, np.ones(8), TrackConfig(),
                            tiny_world.world_from_camera)  # fmt: skip
-    still = ViewStore(kept.store.optics, kept.store.crops, kept.store.config)
+    still = ViewStore(kept.store.rectified, kept.store.crops, kept.store.config)
     assert all(still.fill(i) for i in range(8))
 
     def apart_m(store: ViewStore) -> float:
-        ours, theirs = store.maps[:, k.Z], tracked.store.maps[:, k.Z]
+        ours, theirs = store.maps[:, lay.Z], tracked.store.maps[:, lay.Z]
         return float(np.abs(ours - theirs)[(ours > 0) & (theirs > 0)].mean())
 
     assert apart_m(kept.store) < 0.1 * apart_m(still)
@@ -307,10 +311,10 @@ def test_a_lens_makes_no_difference() -> None:
         inside = (np.abs(rays[..., 0] - 0.1) < 0.12) & (np.abs(rays[..., 1]) < 0.1)
         depth = np.where(inside, 0.7, 1.5).astype(np.float32)
         frame = RgbdFrame("d455", 0, 0, 0, np.full((120, 160, 3), 90, dtype=np.uint8), depth)
-        optics = Optics.of(camera)
-        crop = cut(frame, inside, 0, optics, 1.0, ViewConfig())
+        rectified = Rectification.of(camera)
+        crop = cut(frame, inside, 0, rectified, 1.0, ViewConfig())
         assert crop is not None
-        view = make_view(crop, optics, ViewConfig())
+        view = make_view(crop, rectified, ViewConfig())
         assert view is not None
         corners.append(np.quantile(view.samples[:, :2], [0.02, 0.98], axis=0))
     np.testing.assert_allclose(corners[0], corners[1], atol=0.004)

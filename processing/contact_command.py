@@ -1,0 +1,122 @@
+"""`toss-process SESSION --variant contact-only`: contact learning on poses that are there already."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from processing.pose_source import DEFAULT_STEPS, find_poses
+from recordings.console import Outcome
+from recordings.errors import BadInput
+from recordings.progress import Progress, Silent
+
+if TYPE_CHECKING:
+    from recordings.session import Session
+
+MOST_TOSSES_LEARNED = 64
+"""Learning from more is possible (--train), but gains nothing."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The options of `--variant contact-only`."""
+    group = parser.add_argument_group("contact from poses alone (--variant contact-only)")
+    group.add_argument("--train", metavar="I-J", help="tosses to learn from (default: all but the last)")
+    group.add_argument("--test", metavar="I-J", help="tosses to roll out (default: all, the last one marked)")
+    group.add_argument(
+        "--geometry", choices=("box", "hull", "nonconvex"), help="hull with a shape to start from, else box"
+    )
+    group.add_argument(
+        "--init", metavar="SIDE_M", type=float, help="start from a cube of this side (m), not from a shape"
+    )
+    group.add_argument(
+        "--poses", choices=("truth", "track"), help="the track (default) or, marked in the result, the truth"
+    )
+    group.add_argument(
+        "--steps", metavar="N", type=int, default=DEFAULT_STEPS, help="steps of 1/148 s to roll out (80)"
+    )
+
+
+def run(args: argparse.Namespace, session: Session, out_dir: Path, progress: Progress) -> Outcome:
+    """What the command does; its document is what `--json` prints."""
+    document, text = contact_only(
+        session,
+        out_dir,
+        train=args.train,
+        test=args.test,
+        geometry=args.geometry,
+        init_m=args.init,
+        poses=args.poses,
+        steps=args.steps,
+        device=getattr(args, "device", "cpu") or "cpu",
+        truth=getattr(args, "truth", None),
+        progress=progress,
+    )
+    return Outcome(document, text)
+
+
+def contact_only(
+    session: Session,
+    out_dir: Path,
+    train: str | None = None,
+    test: str | None = None,
+    geometry: str | None = None,
+    init_m: float | None = None,
+    poses: str | None = None,
+    steps: int = DEFAULT_STEPS,
+    device: str = "cpu",
+    progress: Progress | None = None,
+    truth: Path | None = None,
+) -> tuple[dict[str, Any], str]:
+    """Learn from the tosses of `train`, roll out those of `test`, write stage, plot and assets into `out_dir`.
+
+    Returns the JSON document and lines to read. Raises BadInput.
+    """
+    from processing.stages.contact_only import learn_contact_only
+
+    if steps < 1:
+        raise BadInput(f"--steps {steps}: wanted at least 1")
+    if init_m is not None and not 0.005 <= init_m <= 1.0:
+        raise BadInput(f"--init {init_m}: wanted the side of a cube in metres, 0.005 to 1; for example --init 0.05")
+    began = time.perf_counter()
+    learned, tested = _split(session.tosses, train, test)
+    source = find_poses(session, out_dir, poses, sorted({*learned, *tested}), truth)
+    return learn_contact_only(
+        session, out_dir, source, learned, tested, geometry, init_m, steps, device, progress or Silent(), began
+    )
+
+
+def _split(there: Sequence[int], train: str | None, test: str | None) -> tuple[list[int], list[int]]:
+    """Tosses to learn from and to roll out. Without --train: all but the last (of --test, all that are not in it)."""
+    if train is not None:
+        learned = chosen(train, there, "--train")
+        tested = (
+            chosen(test, there, "--test") if test is not None else [t for t in there if t not in learned] or learned
+        )
+        return learned, tested
+    if test is not None:
+        tested = chosen(test, there, "--test")
+        learned = [t for t in there if t not in tested]
+        if not learned:
+            raise BadInput(f"--test {test} takes every toss; wanted some left to learn from, or give --train I-J")
+        return learned, tested
+    return (list(there[:-1]) or list(there))[:MOST_TOSSES_LEARNED], list(there)
+
+
+def chosen(given: str, there: Sequence[int], option: str) -> list[int]:
+    """`I` or `I-J`: those numbers that exist. Raises BadInput where none does."""
+    first, dash, last = given.partition("-")
+    if not first.isdigit() or (dash and not last.isdigit()):
+        raise BadInput(f"{option} {given}: wanted a toss number or a range, for example {option} 0-15")
+    if dash and int(last) < int(first):
+        raise BadInput(f"{option} {given}: the range ends before it begins; wanted {option} {last}-{first}")
+    found = [t for t in there if int(first) <= t <= int(last or first)]
+    if not found:
+        raise BadInput(f"{option} {given}: no such tosses; the session has {_span(there)}")
+    return found
+
+
+def _span(there: Sequence[int]) -> str:
+    return f"{len(there)} tosses, {there[0]} to {there[-1]}" if there else "no tosses"

@@ -1,0 +1,31 @@
+"""Rotations spread evenly: over all orientations, or by given angles about all axes."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray as Array
+
+from recordings.geometry import rotation_exp
+
+
+def turn_grid(angles_deg: tuple[float, ...], axes: int) -> Float[Array, "n 3 3"]:
+    """Rotations by each angle about axes spread evenly over the sphere (Fibonacci)."""
+    n = np.arange(axes) + 0.5
+    z, phi = 1 - 2 * n / axes, np.pi * (1 + 5**0.5) * n
+    r = np.sqrt(1 - z * z)
+    directions = np.stack([r * np.cos(phi), r * np.sin(phi), z], -1)
+    return np.array([rotation_exp(d * np.radians(a)) for a in angles_deg for d in directions])
+
+
+def all_turns(count: int) -> Float[Array, "n 3 3"]:
+    """Rotations spread over all orientations: directions of the axis, and turns about it."""
+    about = max(4, round((count * 1.6) ** (1 / 3)))
+    axes = max(4, count // about)
+    n = np.arange(axes) + 0.5
+    height, around = 1 - 2 * n / axes, np.pi * (1 + 5**0.5) * n
+    out = []
+    for z, phi in zip(height, around):
+        tilt = rotation_exp(np.arccos(z) * np.array([-np.sin(phi), np.cos(phi), 0.0]))
+        out += [tilt @ rotation_exp(np.array([0, 0, 2 * np.pi * a / about])) for a in range(about)]
+    return np.array(out)

@@ -1,0 +1,34 @@
+"""Rigid motions in compiled code: 4x4 poses, and twists in the order (translation, rotation)."""
+
+from __future__ import annotations
+
+from typing import no_type_check
+
+import numpy as np
+from numba import njit
+
+
+@no_type_check
+@njit(cache=True, nogil=True)
+def inverse(pose):
+    out = np.eye(4)
+    back = np.ascontiguousarray(pose[:3, :3].T)
+    out[:3, :3] = back
+    out[:3, 3] = -(back @ np.ascontiguousarray(pose[:3, 3]))
+    return out
+
+
+@no_type_check
+@njit(cache=True, nogil=True)
+def exponential(twist):
+    """4x4 of a twist (translation, rotation): the translation is taken as it is."""
+    out = np.eye(4)
+    angle = np.sqrt(twist[3] ** 2 + twist[4] ** 2 + twist[5] ** 2)
+    s = 1.0 - angle * angle / 6.0 if angle < 1e-4 else np.sin(angle) / angle
+    c = 0.5 - angle * angle / 24.0 if angle < 1e-4 else (1.0 - np.cos(angle)) / (angle * angle)
+    K = np.zeros((3, 3))
+    K[0, 1], K[0, 2], K[1, 2] = -twist[5], twist[4], -twist[3]
+    K[1, 0], K[2, 0], K[2, 1] = twist[5], -twist[4], twist[3]
+    out[:3, :3] += s * K + c * (K @ K)
+    out[:3, 3] = twist[:3]
+    return out

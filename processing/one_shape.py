@@ -1,0 +1,56 @@
+"""Do the tosses that were brought into one object frame show one shape there?
+
+A registration can fit what two tosses see in common and still be wrong by a symmetry (a prism's faces look alike); then
+their frames fused together explain neither.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from processing.images import Images
+from processing.run import Run
+from processing.stages.fuse import fuse_frames
+from processing.stages.judge import judge, residuals
+from processing.store import Done
+
+
+def kept_apart(
+    run: Run, together: Done, shape: Done, images: Mapping[int, Images], joined: Sequence[int]
+) -> tuple[int, ...]:
+    """Tosses that no one shape explains with the others. The outline decides: the share of a toss's mask and the drawn
+    shape that is not common to both, against `CycleConfig.apart_mask`; and half of that must be more than what the
+    toss's own frames fused alone leave (a pixel of a small mask is much, a gripper hides some).
+
+    Where the shape of all explains all, there are none. Else tosses are added one by one to the first, each kept only
+    where the frames fused so far explain every toss among them.
+    """
+    if not _unexplained(run, together, shape, images, joined):
+        return ()
+    kept: list[int] = list(joined[:1])
+    for toss in joined[1:]:
+        tried = [*kept, toss]
+        if not _unexplained(run, together, fuse_frames(run, together, images, tried), images, tried):
+            kept = tried
+    return tuple(t for t in joined if t not in kept)
+
+
+def _unexplained(
+    run: Run, together: Done, shape: Done, images: Mapping[int, Images], tosses: Sequence[int]
+) -> list[int]:
+    """Tosses whose outline the shape does not explain, although their own frames alone do."""
+    limit = run.config.cycle.apart_mask
+    left = _left(run, together, dict.fromkeys(tosses, shape), images)
+    odd = [t for t in tosses if left[t] > limit]
+    if not odd:
+        return []
+    alone = _left(run, together, {t: fuse_frames(run, together, images, [t]) for t in odd}, images)
+    return [t for t in odd if left[t] > alone[t] + 0.5 * limit]
+
+
+def _left(run: Run, together: Done, shapes: Mapping[int, Done], images: Mapping[int, Images]) -> dict[int, float]:
+    """Share of outline and drawn shape that is not common, median over a toss's frames; 0 where none can be judged."""
+    rows = residuals(judge(run, "one shape", dict.fromkeys(shapes, together), shapes, images)).rows
+    return {t: float(np.median(rows[rows[:, 0] == t, 3])) if (rows[:, 0] == t).any() else 0.0 for t in shapes}

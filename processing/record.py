@@ -1,0 +1,56 @@
+"""The record of a variant: which stages hold its tracks, shapes and masks, and what a reader must know of them."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+
+from processing import stage_notices as say
+from processing.passes import Pass
+from processing.run import Run
+from processing.stages.rig import RigResult
+from processing.stages.scene import SceneResult, scene_notes
+from processing.stages.segment import SegmentResult
+from processing.stages.still import in_every_frame
+from processing.store import Done, locked
+from processing.variants import Variant
+from recordings.notices import in_order
+from recordings.results.folder import Scope, TossRecord, VariantRecord, write_variant
+
+
+def write_record(
+    run: Run, variant: Variant, scope: Scope, last: Pass, lost: Mapping[int, Done], scene: Done[SceneResult],
+    rig: Done[RigResult], masks: Mapping[int, Done[SegmentResult]],
+) -> VariantRecord:  # fmt: skip
+    """variants/<name>.<scope>.json. A toss in `lost` has no pose; its shape is said to be that of the first toss."""
+    tracks, shapes = {**last.tracks, **lost}, {**last.shapes, **dict.fromkeys(lost, last.shape)}
+    tosses = tuple(
+        TossRecord(t, in_every_frame(run, t, tracks[t]).name, shapes[t].name, in_every_frame(run, t, masks[t]).name)
+        for t in run.recorded
+    )
+    contact = {str(t): done.name for t, done in last.contact.items()}
+    of_stages = [*say.of_run(run, rig, masks), *(n for done in last.contact.values() for n in say.of_contact(done))]
+    record = VariantRecord(
+        name=variant.name,
+        scope=scope,
+        label=variant.label,
+        session_name=run.session.name,
+        object_name=run.session.object_name,
+        calibration=run.session.calibration,
+        tosses=tosses,
+        shape=tosses[0].shape if scope == "all" else None,
+        contact=next(iter(contact.values()), None) if scope == "all" else None,
+        shared_object_frame=last.shared_frame,
+        session_path=os.path.relpath(run.session.path.resolve(), run.store.results.resolve()),
+        warnings=in_order((*run.warnings, *last.warnings, *of_stages)),
+        notes=(f"tracker: {run.tracker}", *scene_notes(scene), *last.notes),
+        extra={
+            "tracker": run.tracker,
+            "contact_of_toss": contact,
+            "passes": list(last.passes),
+            **({"rollout": last.rollout.name} if last.rollout is not None else {}),
+        },
+    )
+    with locked(run.store.results / ".variants.lock"):
+        write_variant(run.store.results, record)
+    return record

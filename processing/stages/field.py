@@ -1,0 +1,43 @@
+"""Stage `field`: the shape that the tracked frames show, in the frame that their tracks share."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from processing.field.learn import learn_shape
+from processing.images import Images, track_and_image_keys
+from processing.run import Run
+from processing.store import Done, plain
+from recordings.results.folder import read_shape, read_track, write_shape
+
+VERSION = 7
+
+
+@dataclass(frozen=True)
+class FieldResult:
+    """Frames that were looked at, vertices of the mesh, and the share of them that no frame saw."""
+
+    views: int
+    vertices: int
+    unobserved_share: float
+
+
+def learn_field(
+    run: Run, name: str, tracks: Mapping[int, Done], images: Mapping[int, Images], believed: Done | None = None
+) -> Done[FieldResult]:
+    """O. Where no frame looks it is the shape `believed` so far, if there is one (else the hull of what was seen)."""
+    inputs = {"for": name, **track_and_image_keys(tracks, images)}
+    inputs |= {} if believed is None else {"believed": believed.key}
+
+    def compute(folder: Path) -> FieldResult:
+        views = [images[t].open().views(read_track(done.folder, t)) for t, done in tracks.items()]
+        body = None if believed is None else read_shape(believed.folder)
+        progress = run.progress(f"{name}: shape")
+        shape, used = learn_shape(views, run.camera, run.config.shape, run.device, progress, body)
+        write_shape(folder, shape)
+        unseen = 0.0 if shape.observed is None else float((~shape.observed).mean())
+        return FieldResult(used, len(shape.vertices_m), round(unseen, 4))
+
+    return run.store.run("field", VERSION, plain(run.config.shape), inputs, FieldResult, compute)

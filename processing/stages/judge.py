@@ -1,0 +1,61 @@
+"""Stage `judge`: how well shapes and poses explain the raw images, without truth."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from processing.images import Images, track_and_image_keys
+from processing.refine.image_residuals import Explained, explain, pooled
+from processing.run import Run
+from processing.store import Done
+from recordings.results.folder import read_shape, read_track
+from recordings.session_writer import write_json
+
+VERSION = 4
+
+
+@dataclass(frozen=True)
+class JudgeResult:
+    """Means over the frames looked at (`frames`): absolute depth residual (m), 1 - IoU of the outline, colour residual
+    (grey levels of 255); None where no frame tells. `lost`: frames without a pose."""
+
+    depth_m: float | None
+    mask: float | None
+    color: float | None
+    frames: int
+    lost: int
+
+
+def judge(
+    run: Run, name: str, tracks: Mapping[int, Done], shapes: Mapping[int, Done], images: Mapping[int, Images]
+) -> Done[JudgeResult]:
+    """Residuals of every toss's shape at its track's poses on its raw images; `residuals.npz` keeps them by frame."""
+    inputs = {**{f"shape_{t:02d}": s.key for t, s in shapes.items()}, **track_and_image_keys(tracks, images)}
+
+    def compute(folder: Path) -> JudgeResult:
+        parts: list[Explained] = []
+        progress = run.progress(f"{name}: residuals on the raw images")
+        for done, toss in enumerate(tracks):
+            progress.step(done, len(tracks), f"toss {toss}")
+            body, track = read_shape(shapes[toss].folder), read_track(tracks[toss].folder, toss)
+            seen = images[toss].open()
+            parts.append(explain(body, track, seen.frames, seen.masks, run.camera, run.config.cycle.judge))
+        every = pooled(parts)
+        with open(folder / "residuals.npz", "wb") as out:
+            np.savez(out, rows=every.rows)
+        found = every.evidence()
+        write_json(folder / "evidence.json", found.to_json())
+        depth_m, mask, color = (x if np.isfinite(x) else None for x in (found.depth_m, found.mask, found.color))
+        return JudgeResult(depth_m, mask, color, found.frames, found.lost)
+
+    return run.store.run("judge", VERSION, run.config.cycle.judge, inputs, JudgeResult, compute)
+
+
+def residuals(judged: Done[JudgeResult]) -> Explained:
+    """The residuals of single frames that the stage keeps."""
+    with np.load(judged.folder / "residuals.npz", allow_pickle=False) as stored:
+        return Explained(stored["rows"], judged.result.lost)

@@ -1,0 +1,59 @@
+"""Where a run begins: what it needs of its session is checked, and the fingerprints of its inputs are taken."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from processing.config import Config
+from processing.run import CAMERA, MakeProgress, Run
+from processing.segment.background.static_scene import StaticScene
+from processing.sensor.table_plane import with_table_from_depth
+from processing.stages.scene import learn_static_scene
+from processing.stages.still import without_waiting
+from processing.store import Store
+from recordings.errors import BadInput
+from recordings.notices import Notice
+from recordings.session import Session
+from recordings.session_writer import file_sha256
+
+
+def start_run(
+    session: Session,
+    tosses: Sequence[int],
+    results: Path,
+    config: Config,
+    tracker: str,
+    progress: MakeProgress,
+    device: str = "cpu",
+) -> Run:
+    """The run of these tosses into a results folder. Raises BadInput where the session lacks what vision needs."""
+    if not tosses:
+        raise BadInput(f"{session.path} has no tosses; wanted a session with toss_00.mcap and so on")
+    if CAMERA not in session.calibration.cameras:
+        raise BadInput(
+            f"{session.path}: the calibration has no intrinsics of {CAMERA}; it has "
+            f"{sorted(session.calibration.cameras) or 'no camera'}. Vision needs them"
+        )
+    keys = {f"toss_{t:02d}": file_sha256(session.file(t)) for t in tosses}
+    physics = json.dumps(session.start.get("object"), sort_keys=True, default=str).encode()
+    keys |= {"calibration": _calibration_key(session), "physics": hashlib.sha256(physics).hexdigest()}
+    return without_waiting(Run(session, tuple(tosses), Store(results), config, tracker, device, progress, keys))
+
+
+def with_table(run: Run) -> Run:
+    """The same run with the table that the depth of the empty scene shows (`--table-from-depth`)."""
+    scene = StaticScene.read(learn_static_scene(run).folder)
+    calibration, found = with_table_from_depth(run.session.calibration, CAMERA, scene.depth_m)
+    session = run.session.with_calibration(calibration)
+    seen = f"the table is from depth ({100 * found['share']:.0f} % of it, spread {1e3 * found['spread_m']:.1f} mm)"
+    told = Notice("table", "low", seen, "gravity is taken to be its normal")
+    return replace(run, session=session, keys={**run.keys, "calibration": _calibration_key(session)},
+                   warnings=(*run.warnings, told))  # fmt: skip
+
+
+def _calibration_key(session: Session) -> str:
+    return hashlib.sha256(json.dumps(session.calibration.to_json(), sort_keys=True).encode()).hexdigest()

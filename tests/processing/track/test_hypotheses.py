@@ -1,0 +1,110 @@
+"""Trajectory hypotheses: which views are compared, the appearance likelihood ratio of two, depth's motion from pose to
+pose."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from processing.features.sift import Sift
+from processing.motion.interpolate import carried_on
+from processing.track.appearance_ratio import AppearanceRatioConfig, log_likelihood_ratio
+from processing.track.beam import Scene
+from processing.track.joint_refinement import GraphConfig, choose_pairs
+from processing.track.track_toss import TrackConfig, views_of
+from recordings.geometry import rotation_exp
+from recordings.progress import Silent
+
+ONE_COLOR = np.tile([[90, 160, 110]], (6, 1))
+SIZE_M = np.array([0.09, 0.07, 0.07])
+
+
+def turning(angles_deg: list[float]) -> np.ndarray:
+    """Poses half a metre before the camera, turned about its vertical axis."""
+    poses = np.tile(np.eye(4), (len(angles_deg), 1, 1))
+    poses[:, 2, 3] = 0.5
+    for pose, angle in zip(poses, angles_deg):
+        pose[:3, :3] = rotation_exp(np.array([0, np.radians(angle), 0]))
+    return poses
+
+
+def loops_of(view: int, pairs: np.ndarray) -> set[int]:
+    return {int(j) for i, j in pairs if i == view and abs(i - j) > 2}
+
+
+def pairs_of(angles_deg: list[float], still: list[int]) -> np.ndarray:
+    n = len(angles_deg)
+    stands = np.isin(np.arange(n), still)
+    return choose_pairs(
+        turning(angles_deg), np.ones(n, dtype=bool), np.zeros(n, dtype=np.int64), np.zeros(3), stands, GraphConfig()
+    )
+
+
+def test_a_body_that_stands_still_is_compared_with_what_it_showed_before_and_after() -> None:
+    angles, still = [0.0] * 12 + [20.0, 40.0, 35.0, 10.0], list(range(1, 12))
+    assert loops_of(0, pairs_of(angles, still)) == {12, 13, 14, 15}
+    assert loops_of(0, pairs_of(angles, [])) & set(range(12))
+
+
+def test_views_are_compared_over_wide_turns_only_where_near_ones_are_few() -> None:
+    chain = [0.0, 55.0, 100.0, 140.0, 180.0, 220.0, 260.0, 305.0]
+    assert loops_of(0, pairs_of(chain, [])) == {7}  # 55 degrees away, the other way round
+    near = [0.0, 55.0, 100.0, 140.0, 180.0, 10.0, 220.0, 260.0, 20.0, 240.0]
+    assert loops_of(0, pairs_of(near, [])) == {5, 8}
+
+
+@pytest.mark.parametrize("delay_s", [-0.012, 0.016])
+def test_depths_motion_goes_on_changing_as_it_did(delay_s: float) -> None:
+    center, step_s = np.array([0.02, -0.01, 0.03]), 1 / 30
+
+    def at(t: float) -> np.ndarray:
+        pose = np.eye(4)
+        pose[:3, :3] = rotation_exp(np.array([0, 0, 5 * t + 20 * t * t]))  # a growing spin about one axis
+        pose[:3, 3] = np.array([0.4 * t, 0.1, 0.8]) + np.array([0, 2, -3]) * t * t - pose[:3, :3] @ center
+        return pose
+
+    three = np.stack([at(-2 * step_s), at(-step_s), at(0.0)])
+    moved = carried_on(three, np.array([-2, -1, 0]) * step_s, delay_s, center) @ at(0.0)
+    np.testing.assert_allclose(moved, at(delay_s), atol=1e-6)
+
+
+def test_depths_motion_beyond_an_impact_is_that_after_it() -> None:
+    three = turning([0.0, 0.0, 10.0])
+    three[2, 0, 3] = 0.04
+    moved = carried_on(three, np.array([0, 1, 2]) / 30, 1 / 60, np.zeros(3))
+    np.testing.assert_allclose(
+        moved @ three[2], turning([15.0])[0] + 0.06 * np.eye(4)[:, :1] @ np.eye(4)[3:], atol=1e-6
+    )
+
+
+def seen_turning(world: Any, faces_rgb: np.ndarray) -> tuple[Scene, np.ndarray]:
+    """A nearly square bar on its way over the table, turned about its long axis, and its true poses."""
+    frames, masks, poses = [], [], []
+    camera_from_world = world.world_from_camera.inverse()
+    for i, angle in enumerate([0.0, 15.0, 30.0, 45.0, 60.0, 75.0, 90.0]):
+        pose = world.poses(9)[i]
+        turn = rotation_exp(np.array([np.radians(angle), 0, 0]))
+        pose = type(pose)("world", "object", turn, pose.translation_m)
+        frame, mask = world.see(pose, i, box_m=SIZE_M, faces_rgb=faces_rgb)
+        frames.append(frame)
+        masks.append(mask)
+        poses.append((camera_from_world @ pose).matrix)
+    store, times_s, _ = views_of(
+        frames, masks, world.camera, np.ones(7), TrackConfig(), world.world_from_camera, Silent()
+    )
+    return Scene(store, times_s, np.zeros(3), np.zeros(3), Sift()), np.stack(poses)
+
+
+@pytest.mark.parametrize("label", [True, False])
+def test_a_label_decides_a_quarter_turn_of_a_square_bar_and_plain_paint_does_not(tiny_world: Any, label: bool) -> None:
+    faces = ONE_COLOR.copy()
+    faces[4 if label else 0] = ONE_COLOR[0] + [60, -60, 60] if label else ONE_COLOR[0]
+    scene, poses = seen_turning(tiny_world, faces)
+    flipped = poses.copy()
+    flipped[4:, :3, :3] = poses[4:, :3, :3] @ rotation_exp(np.array([np.pi / 2, 0, 0]))
+    use, config = np.ones(len(poses), dtype=bool), AppearanceRatioConfig()
+    nats = log_likelihood_ratio(scene, poses, flipped, use, config)
+    assert nats == pytest.approx(-log_likelihood_ratio(scene, flipped, poses, use, config))
+    assert nats > 3 if label else nats == 0

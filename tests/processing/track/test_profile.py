@@ -1,0 +1,158 @@
+"""A body of revolution's profile, and the poses that it ties together: known answers."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from processing.features.sift import Sift
+from processing.motion import se3_kernels as se3
+from processing.sensor import view_layout as lay
+from processing.sensor.rectification import Rectification
+from processing.sensor.view import Crop, ViewConfig, ViewStore
+from processing.track.beam import Scene
+from processing.track.revolution.axis import Axis
+from processing.track.revolution.azimuth import AzimuthConfig, given_azimuths
+from processing.track.revolution.profile import BodyConfig, RoundBody, anchored, is_round
+from recordings.geometry import CameraModel, rotation_exp
+
+CAMERA = CameraModel("d455", 640, 480, np.array([[386.0, 0, 320], [0, 386, 240], [0, 0, 1]]))
+RADIUS_M, HALF_M = 0.04, 0.05
+AXIS = Axis(np.array([0.0, 0.0, 1.0]), np.zeros(3))
+
+
+def can_poses() -> np.ndarray:
+    """A can that turns over before the camera."""
+    out = []
+    for n in range(8):
+        pose = np.eye(4)
+        pose[:3, :3] = rotation_exp(np.array([0.5 + 0.3 * n, 0.0, 0.0])) @ rotation_exp(np.array([0.0, 0.0, 0.7 * n]))
+        pose[:3, 3] = [0.01 * n, -0.02, 0.7 + 0.01 * n]
+        out.append(pose)
+    return np.array(out)
+
+
+def can(poses: np.ndarray) -> ViewStore:
+    """What the camera sees of it, without noise: mask by the rays that hit, samples of what faces the camera."""
+    rectified = Rectification.of(CAMERA)
+    crops, views = [], []
+    for n, pose in enumerate(poses):
+        center = (pose[:2, 3] / pose[2, 3] * 386 + [320, 240]).astype(int)
+        corner = (int(center[0]) - 60, int(center[1]) - 60)
+        v, u = np.mgrid[0:120, 0:120]
+        rays = np.stack([(u + corner[0] - 320) / 386, (v + corner[1] - 240) / 386, np.ones_like(u)], -1)
+        z, normal = seen(rays.reshape(-1, 3), pose)
+        hit = np.isfinite(z)
+        depth = np.where(hit, z, 0).reshape(120, 120).astype(np.float32)
+        mask = hit.reshape(120, 120)
+        crops.append(Crop(n, corner, mask, depth, np.zeros((120, 120, 3), np.float32), np.zeros_like(mask), None, 0.0))
+        inside = np.flatnonzero(hit)
+        chosen = np.random.default_rng(n).permutation(inside)[:500]
+        views.append((rays.reshape(-1, 3)[chosen] * z[chosen, None], normal[chosen]))
+    store = ViewStore(rectified, list(crops), ViewConfig())
+    for n, (points, normals) in enumerate(views):
+        first = int(store.table[n, lay.FIRST])
+        store.samples[first : first + len(points), :6] = np.concatenate([points, normals], 1)
+        store.table[n, [lay.U0, lay.V0, lay.WIDTH, lay.HEIGHT, lay.COUNT]] = [*crops[n].corner, 120, 120, len(points)]
+        offset = int(store.table[n, lay.OFFSET])
+        store.maps[offset : offset + 120 * 120, lay.Z] = crops[n].depth_m.ravel()
+    return store
+
+
+def seen(rays: np.ndarray, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Depth along each ray (infinite: it misses) and normals, camera axes."""
+    start, way = -pose[:3, :3].T @ pose[:3, 3], rays @ pose[:3, :3]
+    z, normal = np.full(len(rays), np.inf), np.zeros((len(rays), 3))
+    a, b = np.sum(way[:, :2] ** 2, 1), way[:, :2] @ start[:2]
+    root = b * b - a * (start[:2] @ start[:2] - RADIUS_M**2)
+    with np.errstate(invalid="ignore"):
+        wall = (-b - np.sqrt(root)) / a
+    ok = np.abs(start[2] + wall * way[:, 2]) < HALF_M
+    z[ok] = wall[ok]
+    normal[ok, :2] = (start + wall[:, None] * way)[ok, :2] / RADIUS_M
+    for side in (-1.0, 1.0):
+        t = (side * HALF_M - start[2]) / way[:, 2]
+        at = start + t[:, None] * way
+        ok = (np.hypot(at[:, 0], at[:, 1]) < RADIUS_M) & (t < z)
+        z[ok], normal[ok] = t[ok], [0.0, 0.0, side]
+    return z, normal @ pose[:3, :3].T
+
+
+def solved(body: RoundBody, poses: np.ndarray, steps: int = 8) -> np.ndarray:
+    place = np.arange(len(poses))
+    for _ in range(steps):
+        H, g = np.zeros((len(poses), len(poses), 6, 6)), np.zeros((len(poses), 6))
+        body.add(H, g, poses, place)
+        full = H.transpose(0, 2, 1, 3).reshape(6 * len(poses), -1)
+        free = np.kron(np.eye(len(poses)), np.diag([0, 0, 0, 0, 0, 1.0]))  # no view's turn about the axis (z)
+        twists = -np.linalg.solve(full + 1e3 * np.trace(full) / len(full) * free, g.reshape(-1)).reshape(-1, 6)
+        poses = np.array([p @ se3.inverse(se3.exponential(t)) for p, t in zip(poses, twists)])
+    return poses
+
+
+@pytest.fixture(scope="module")
+def cans() -> tuple[ViewStore, np.ndarray]:
+    return can(can_poses()), can_poses()
+
+
+def test_views_that_drifted_along_and_off_the_axis_come_back_to_one_body(cans: tuple[ViewStore, np.ndarray]) -> None:
+    store, truth = cans
+    drifted = truth.copy()
+    for n in range(len(truth)):
+        away = np.array([0.0, 0.0002 * n, 0.0006 * n, 0.004 * n, 0.0, 0.0])
+        drifted[n] = truth[n] @ se3.exponential(away)
+    poses = solved(RoundBody(store, drifted, np.ones(len(truth), dtype=bool), AXIS, BodyConfig()), drifted)
+
+    def apart(found: np.ndarray) -> tuple[float, float]:
+        """Of each view's axis against the first view's: along or off it (m), and tilt (rad)."""
+        gaps = np.linalg.inv(found) @ truth
+        gaps = gaps @ np.linalg.inv(gaps[0])
+        return float(np.linalg.norm(gaps[:, :3, 3], axis=1).max()), float(np.arccos(gaps[:, 2, 2].clip(-1, 1)).max())
+
+    assert apart(drifted)[0] > 0.004
+    shift, tilt = apart(poses)
+    assert shift < 0.0007
+    assert tilt < np.radians(0.5)
+
+
+def test_right_poses_show_the_body_as_large_as_it_is(cans: tuple[ViewStore, np.ndarray]) -> None:
+    store, truth = cans
+    body = RoundBody(store, truth, np.ones(len(truth), dtype=bool), AXIS, BodyConfig())
+    solved(body, truth, 6)
+    low, high = body.ends_m
+    assert high - low == pytest.approx(2 * HALF_M, abs=1e-3)
+    assert body.radius_m == pytest.approx(RADIUS_M, abs=5e-4)
+    assert body.outline_rms_px < 0.4
+
+
+def test_outlines_say_whether_a_body_is_round_about_an_axis(cans: tuple[ViewStore, np.ndarray]) -> None:
+    store, truth = cans
+    every = np.ones(len(truth), dtype=bool)
+    assert is_round(store, truth, every, AXIS, BodyConfig())
+    assert not is_round(store, truth, every, Axis(np.array([1.0, 0.0, 0.0]), np.zeros(3)), BodyConfig())
+
+
+def test_given_azimuths_of_a_can_that_nothing_marks_stay_and_grow_uncertain() -> None:
+    poses = can_poses()
+    store = can(poses)
+    assert all(store.fill(n) for n in range(len(poses)))
+    scene = Scene(store, np.arange(len(poses)) / 30, np.zeros(3), np.zeros(3), Sift())
+    given = given_azimuths(scene, poses, np.ones(len(poses), dtype=bool), AXIS, AzimuthConfig())
+    np.testing.assert_array_equal(given.poses, poses)
+    sigma_deg = np.degrees(given.sigma_rad)
+    assert sigma_deg[0] == 0
+    assert (np.diff(sigma_deg) > 0).all()
+    assert sigma_deg[-1] > 10
+
+
+def test_an_anchored_view_keeps_its_pose_and_the_axis_its_place_in_space() -> None:
+    poses = can_poses()
+    wanted = poses[2] @ se3.exponential(np.array([0.001, 0.002, -0.001, 0.01, 0.02, 0.03]))
+    covariance = np.tile(np.diag([1e-6] * 6), (len(poses), 1, 1))
+    moved, spread, axis = anchored(poses, covariance, AXIS, 2, wanted)
+    np.testing.assert_allclose(moved[2], wanted, atol=1e-12)
+    assert (spread[2] == 0).all()
+    for before, after in zip(poses, moved):
+        np.testing.assert_allclose(before[:3, :3] @ AXIS.direction, after[:3, :3] @ axis.direction, atol=1e-9)
+        there = after[:3, :3] @ axis.point_m + after[:3, 3]
+        np.testing.assert_allclose(np.cross(there - before[:3, 3], before[:3, 2]), 0, atol=1e-9)
