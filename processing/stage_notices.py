@@ -10,6 +10,7 @@ from typing import Any
 from processing.config import CycleConfig
 from processing.refine.image_residuals import Difference
 from processing.run import Run
+from processing.stages.lose import SEE
 from processing.stages.register import RegisterResult
 from processing.stages.rig import RigResult
 from processing.stages.rollouts import RolloutResult
@@ -19,7 +20,6 @@ from processing.store import Done
 from recordings.mcap import arm_codec
 from recordings.notices import Notice
 
-SEE = "look at these frames with `toss-view RESULTS`"
 MANY_UNFIT = 1 / 3
 """Share of a toss's frames from which on more than noise is the likelier cause."""
 

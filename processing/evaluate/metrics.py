@@ -200,18 +200,6 @@ def repaired(mesh: trimesh.Trimesh) -> trimesh.Trimesh | None:
     return out if out.is_watertight else None
 
 
-def depth_below_plane_m(
-    vertices_m: Float[Array, "v 3"],
-    world_from_object: Float[Array, "n 4 4"],
-    normal_world: Float[Array, "3"],
-    offset_m: float,
-) -> Float[Array, " n"]:
-    """How far the lowest vertex lies below the plane n . x = offset, per pose; NaN without a pose."""
-    up = np.einsum("nij,i->nj", world_from_object[:, :3, :3], normal_world)
-    lowest = (vertices_m @ up.T).min(0) + world_from_object[:, :3, 3] @ normal_world - offset_m
-    return np.asarray(np.where(np.isfinite(lowest), np.maximum(-lowest, 0.0), np.nan))
-
-
 def rollout_errors(
     rolled: Float[Array, "t 4 4"],
     rolled_s: Float[Array, " t"],

@@ -19,7 +19,7 @@ from processing.evaluate.report_loops import SLOWED, toss_loops
 from processing.evaluate.report_mesh import turning_shapes
 from processing.evaluate.report_shapes import ERROR_FULL_MM, Shown, shape_picture, true_shape
 from processing.evaluate.report_worst import Worst, worst_frames
-from processing.evaluate.table import COLUMNS, Row, said
+from processing.evaluate.table import COLUMNS, Row, said, with_interval
 from recordings.film.film import STATUS_RGB
 from recordings.film.raster import covered_pixels, outlined
 from recordings.mcap.codec import decode_image
@@ -104,7 +104,7 @@ def _physics(document: dict[str, Any]) -> str:
     head = "".join(f"<th>{title}</th>" for _, title in titles)
     body = "".join(
         f"<tr><td>{escape(r['variant'])} ({r['scope']})</td>"
-        + "".join(f"<td>{with_bounds(r['values'].get(name))}</td>" for name, _ in titles)
+        + "".join(f"<td>{with_interval(r['values'].get(name))}</td>" for name, _ in titles)
         + "</tr>"
         for r in rows
     )
@@ -113,15 +113,6 @@ def _physics(document: dict[str, Any]) -> str:
         "the table and restitution; rollouts: the mean error of the learned model, simulated from the release on. In "
         "brackets: 95 % intervals.</p>"
     )
-
-
-def with_bounds(value: dict[str, Any] | None) -> str:
-    """A number of table.json with the bounds of its interval, where it has some."""
-    if value is None or value["value"] is None:
-        return "–"
-    form = "{:.3f}" if value["unit"] == "" else "{:.1f}"
-    text, low, high = form.format(value["value"]), value.get("low"), value.get("high")
-    return text if low is None or high is None else f"{text} [{form.format(low)}, {form.format(high)}]"
 
 
 def _shapes(results: Results, rows: Sequence[Row], truth: trimesh.Trimesh | None) -> str:
@@ -267,10 +258,12 @@ def _score_table(document: dict[str, Any]) -> str:
     for row in document["rows"]:
         cells = "".join(f"<td>{_cell(row, name)}</td>" for name, _ in COLUMNS)
         body += f"<tr><td>{escape(row['variant'])} ({row['scope']})</td>{cells}</tr>"
+    grey = "Grey: the paper's figure for this row, on another data set."
+    legend = f" <span class=paper>{grey}</span>" if any(row["paper"] for row in document["rows"]) else ""
     return (
         f"<table><tr><th>variant</th>{head}</tr>{body}</table><p>ADD, ADD-S: area under the recall curve, 0 to 0.1 m. "
         "SR: share of frames within 5 degrees and 5 cm. CD: Chamfer distance of the shape. Each toss is aligned at its "
-        "first frame. <span class=paper>Grey: the paper's figure for this row, on another data set.</span></p>"
+        f"first frame.{legend}</p>"
     )
 
 

@@ -188,7 +188,7 @@ def _contact_block(rows: Sequence[dict[str, Any]]) -> list[str]:
 
 def with_interval(value: Mapping[str, Any] | None) -> str:
     """A value of table.json with its 95 % interval, where it has one: `0.178 [0.121, 0.235]`."""
-    if value is None:
+    if value is None or value["value"] is None:
         return "-"
     form = "{:.3f}" if value["unit"] == "" else "{:.1f}"
     text = form.format(value["value"])

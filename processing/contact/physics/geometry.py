@@ -150,11 +150,6 @@ def hull_mesh(points_m: Float[Array, "v 3"]) -> tuple[Float[Array, "w 3"], Int[A
     return vertices, faces
 
 
-def edges_of_box(parameters: Float[Array, " p"]) -> Float[Array, "3"]:
-    """Edge lengths of a Box in metres."""
-    return 2 * SCALE_M * np.abs(parameters[:3])
-
-
 def pieces_mesh(
     points_m: Float[Array, "v 3"], pieces: Sequence[Sequence[int]]
 ) -> tuple[Float[Array, "w 3"], Int[Array, "f 3"]]:

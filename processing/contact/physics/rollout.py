@@ -24,7 +24,6 @@ from recordings.constants import GRAVITY_M_S2
 
 EPSILON = 1e-4
 TOLERANCE = 1e-6
-DEFAULT_STEP_S = 1.0 / 148.0
 
 
 @dataclass(frozen=True, eq=False)
