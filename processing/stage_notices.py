@@ -1,5 +1,4 @@
-"""What the stages noticed, told to the user: from what they counted, so that a result that was read says the same as
-one that was made."""
+"""The stages' notices, derived from their results: a result that was read says the same as one that was computed."""
 
 from __future__ import annotations
 
@@ -82,7 +81,7 @@ def of_tracks(tracks: Mapping[int, Done[TrackResult]]) -> tuple[Notice, ...]:
 
 
 def of_track(toss: int, done: Done[TrackResult]) -> list[Notice]:
-    """Frames that no pose explains. What is behind them is told by how many they are."""
+    """Frames that no pose explains; the share of such frames decides which cause is named."""
     unfit, frames = done.result.unfit, max(done.result.frames, 1)
     if not unfit:
         return []
@@ -147,23 +146,26 @@ def no_rollouts(done: Done[RolloutResult]) -> tuple[Notice, ...]:
     return (Notice("rollout", "low", f"no rollouts: {why}"),) if why else ()
 
 
-def second_pass_not_kept(told: Mapping[str, Any]) -> Notice:
+def second_pass_not_kept(comparison: Mapping[str, Any]) -> Notice:
     """The second pass explains the raw images worse."""
     seen = (
-        f"{told['of']}: the second pass was not kept: it explains the raw images {_percent(told)} worse than the first"
+        f"{comparison['of']}: the second pass was not kept: it explains the raw images {_percent(comparison)} "
+        "worse than the first"
     )
     return Notice("second pass", "low", seen, "poses and shape are those before it")
 
 
-def second_pass_kept(told: Mapping[str, Any], config: CycleConfig) -> tuple[str, ...]:
+def second_pass_kept(comparison: Mapping[str, Any], config: CycleConfig) -> tuple[str, ...]:
     """Of a second pass that was kept: how it explains the raw images, and what that means."""
-    if told["same"]:
-        return (f"{told['of']}: the second pass was kept: it only repeats the first one",)
-    if told["worse_share"] > 0:
+    if comparison["same"]:
+        return (f"{comparison['of']}: the second pass was kept: it only repeats the first one",)
+    if comparison["worse_share"] > 0:
         limit = f"beyond {100 * config.much_worse:.0f} % it is left out"
-        return (f"{told['of']}: the second pass was kept: it explains the raw images as well as the first "
-                f"({_percent(told)} worse; {limit})",)  # fmt: skip
-    return (f"{told['of']}: the second pass was kept: it explains the raw images better ({_percent(told)})",)
+        return (f"{comparison['of']}: the second pass was kept: it explains the raw images as well as the first "
+                f"({_percent(comparison)} worse; {limit})",)  # fmt: skip
+    return (
+        f"{comparison['of']}: the second pass was kept: it explains the raw images better ({_percent(comparison)})",
+    )
 
 
 def departures(config: CycleConfig) -> tuple[str, ...]:
@@ -177,9 +179,9 @@ def departures(config: CycleConfig) -> tuple[str, ...]:
     return tuple(notes)
 
 
-def converged(told: Mapping[str, Any]) -> str:
+def converged(comparison: Mapping[str, Any]) -> str:
     """Why no further pass was made."""
-    number, worse = told["pass"], 100 * told["worse_share"]
+    number, worse = comparison["pass"], 100 * comparison["worse_share"]
     if worse > 0:
         return f"converged: pass {number} explains the raw images no better (worse by {worse:.2f} %) and is left out"
     return f"converged: pass {number} changed nothing more"
@@ -190,5 +192,5 @@ def not_converged(passes: int) -> Notice:
     return Notice("converged", "low", f"poses and shape still change after {passes} passes more")
 
 
-def _percent(told: Mapping[str, Any]) -> str:
-    return f"{100 * abs(told['worse_share']):.1f} %"
+def _percent(comparison: Mapping[str, Any]) -> str:
+    return f"{100 * abs(comparison['worse_share']):.1f} %"

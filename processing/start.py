@@ -50,9 +50,9 @@ def with_table(run: Run) -> Run:
     calibration, found = with_table_from_depth(run.session.calibration, CAMERA, scene.depth_m)
     session = run.session.with_calibration(calibration)
     seen = f"the table is from depth ({100 * found['share']:.0f} % of it, spread {1e3 * found['spread_m']:.1f} mm)"
-    told = Notice("table", "low", seen, "gravity is taken to be its normal")
+    notice = Notice("table", "low", seen, "gravity is taken to be its normal")
     return replace(run, session=session, keys={**run.keys, "calibration": _calibration_key(session)},
-                   warnings=(*run.warnings, told))  # fmt: skip
+                   warnings=(*run.warnings, notice))  # fmt: skip
 
 
 def _calibration_key(session: Session) -> str:

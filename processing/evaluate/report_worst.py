@@ -29,7 +29,7 @@ LEAST_RESIDUAL, SURE = 0.05, 0.5
 
 
 @dataclass(frozen=True, eq=False)
-class Evidence:
+class TossDiagnostics:
     """What is known of every frame of a toss; NaN where it is not. `mask_px`: the object's pixels; `at_edge`: 1 where
     they reach the image's edge; `phase` is empty where it is not known."""
 
@@ -56,11 +56,11 @@ class Worst:
 
 def worst_frames(results: Results, row: Row) -> list[Worst]:
     """The worst frames of a row, worst first: runs of lost ones (a half of them at most), then by error or fit."""
-    every = {toss: evidence(results, row, toss) for toss in row.tracks}
+    every = {toss: diagnostics(results, row, toss) for toss in row.tracks}
     lost = sorted(((b - a, t, a) for t, e in every.items() for a, b in lost_runs(e.track)), reverse=True)
     found = [_lost(every[t], a, a + n) for n, t, a in lost[: WORST // 2]]
     ranked = sorted(
-        ((s, t, i) for t, e in every.items() for i, s in enumerate(_badness(e)) if np.isfinite(s)), reverse=True
+        ((s, t, i) for t, e in every.items() for i, s in enumerate(_severity(e)) if np.isfinite(s)), reverse=True
     )
     taken: list[tuple[int, int]] = []
     for _, toss, i in ranked:
@@ -72,7 +72,7 @@ def worst_frames(results: Results, row: Row) -> list[Worst]:
     return found
 
 
-def evidence(results: Results, row: Row, toss: int) -> Evidence:
+def diagnostics(results: Results, row: Row, toss: int) -> TossDiagnostics:
     """Everything that is kept of how a toss was tracked and scored."""
     track, record = row.tracks[toss], row.record.toss(toss)
     n = len(track.status)
@@ -89,7 +89,7 @@ def evidence(results: Results, row: Row, toss: int) -> Evidence:
         for i, mask in enumerate(masks):
             mask_px[i] = mask.sum()
             at_edge[i] = mask[[0, -1]].any() or mask[:, [0, -1]].any()
-    return Evidence(track, error_m, error_deg, residual, on_surface, mask_px, confidence, at_edge, phase)
+    return TossDiagnostics(track, error_m, error_deg, residual, on_surface, mask_px, confidence, at_edge, phase)
 
 
 def _errors(
@@ -109,7 +109,7 @@ def _errors(
     return error_m, error_deg, tuple(phases) if score.phase else ()
 
 
-def _badness(e: Evidence) -> Float[Array, " n"]:
+def _severity(e: TossDiagnostics) -> Float[Array, " n"]:
     """Larger is worse; lost frames are not ranked here. Of an error in degrees, one counts as a millimetre."""
     known = np.isfinite(e.error_m).any()
     bad = 1e3 * e.error_m + e.error_deg if known else e.residual
@@ -122,20 +122,20 @@ def lost_runs(track: ObjectTrack) -> list[tuple[int, int]]:
     return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2])]
 
 
-def _lost(e: Evidence, first: int, after: int) -> Worst:
+def _lost(e: TossDiagnostics, first: int, after: int) -> Worst:
     """A run of lost frames, shown by its middle."""
     middle = (first + after - 1) // 2
     of = f"frame {first} is" if after - first == 1 else f"frames {first} to {after - 1} are"
     return Worst(e.track.toss, middle, f"{of} lost", reasons(e, middle))
 
 
-def _what(e: Evidence, i: int) -> str:
+def _what(e: TossDiagnostics, i: int) -> str:
     if np.isfinite(e.error_m[i]):
         return f"{1e3 * e.error_m[i]:.1f} mm and {e.error_deg[i]:.1f} deg off the truth"
     return f"fits worst: residual {e.residual[i]:.2f}"
 
 
-def reasons(e: Evidence, i: int) -> tuple[str, ...]:
+def reasons(e: TossDiagnostics, i: int) -> tuple[str, ...]:
     """What is unusual about a frame, beside what is usual in its toss; never empty."""
     said = [*_of_the_mask(e, i), *_of_the_fit(e, i), *_of_the_motion(e, i)]
     if e.track.status[i] == "interpolated":
@@ -143,7 +143,7 @@ def reasons(e: Evidence, i: int) -> tuple[str, ...]:
     return tuple(said) or ("nothing that was measured is unusual in it",)
 
 
-def _of_the_mask(e: Evidence, i: int) -> list[str]:
+def _of_the_mask(e: TossDiagnostics, i: int) -> list[str]:
     usual, said = _usual(e.mask_px), []
     if e.mask_px[i] == 0:
         return ["nothing of the object was found in the image"]
@@ -156,7 +156,7 @@ def _of_the_mask(e: Evidence, i: int) -> list[str]:
     return said
 
 
-def _of_the_fit(e: Evidence, i: int) -> list[str]:
+def _of_the_fit(e: TossDiagnostics, i: int) -> list[str]:
     said, usual, on = [], _usual(e.residual), _usual(e.on_surface)
     if e.residual[i] > max(BAD * usual, LEAST_RESIDUAL):
         said.append(
@@ -167,7 +167,7 @@ def _of_the_fit(e: Evidence, i: int) -> list[str]:
     return said
 
 
-def _of_the_motion(e: Evidence, i: int) -> list[str]:
+def _of_the_motion(e: TossDiagnostics, i: int) -> list[str]:
     phase = e.phase[i] if e.phase else ""
     if phase == "impact":
         return ["it is at an impact: the motion changes between two frames"]

@@ -57,15 +57,15 @@ class Grid:
         return self.origin_m + self.voxel_m * cells
 
 
-def fuse(views: Sequence[FieldView], config: FuseConfig, believed: ObjectShape | None = None) -> Grid:
+def fuse(views: Sequence[FieldView], config: FuseConfig, prior_shape: ObjectShape | None = None) -> Grid:
     """Average the views' signed distances on a grid round the object and complete what no view saw: by the shape that
-    is believed so far (in the views' object frame), or by the hull of what was seen.
+    is known so far (in the views' object frame), or by the hull of what was seen.
 
     Raises BadInput when the views hold too few depth points.
     """
     low, high = object_box(views)
-    if believed is not None:
-        low, high = np.minimum(low, believed.vertices_m.min(0)), np.maximum(high, believed.vertices_m.max(0))
+    if prior_shape is not None:
+        low, high = np.minimum(low, prior_shape.vertices_m.min(0)), np.maximum(high, prior_shape.vertices_m.max(0))
     low, high = low - config.border_m, high + config.border_m
     voxel_m = max(config.voxel_m, float(np.cbrt(np.prod(high - low) / config.most_cells)))
     shape = tuple(int(n) for n in np.ceil((high - low) / voxel_m).astype(int) + 1)
@@ -97,9 +97,9 @@ def fuse(views: Sequence[FieldView], config: FuseConfig, believed: ObjectShape |
     rgb = paint[..., :3] / np.maximum(paint[..., 3:], 1e-9)
     grid = Grid(low, voxel_m, config.truncation_m, sdf_m, weight, free, rgb)
     painted = paint[..., 3] > 0
-    if believed is None:
+    if prior_shape is None:
         return replace(complete(grid), rgb=_spread(rgb, painted))
-    return _believing(grid, believed, painted)
+    return _completed_by_prior(grid, prior_shape, painted)
 
 
 def _spread(rgb: Float32[Array, "a b c 3"], known: Bool[Array, "a b c"]) -> Float32[Array, "a b c 3"]:
@@ -171,19 +171,19 @@ def complete(grid: Grid) -> Grid:
     return _completed(grid, inside_hull(grid.sdf_m.shape, surface))
 
 
-def _believing(grid: Grid, believed: ObjectShape, painted: Bool[Array, "a b c"]) -> Grid:
+def _completed_by_prior(grid: Grid, prior_shape: ObjectShape, painted: Bool[Array, "a b c"]) -> Grid:
     """Fill what no view saw with the distances and colours of a shape, but for where a ray passed."""
     unseen = (grid.weight == 0) & ~grid.free
     cells = np.argwhere(unseen)
     distance_m = np.full(grid.sdf_m.shape, np.inf, dtype=np.float32)
-    distance_m[unseen] = _signed_distance(believed, grid.points(cells.astype(np.float64)))
+    distance_m[unseen] = _signed_distance(prior_shape, grid.points(cells.astype(np.float64)))
     filled = _completed(grid, distance_m < 0)
     close = unseen & (np.abs(distance_m) < grid.truncation_m)
     rgb = grid.rgb.copy()
-    if believed.vertex_rgb is not None:
+    if prior_shape.vertex_rgb is not None:
         shown = close & ~painted
-        _, nearest = cKDTree(believed.vertices_m).query(grid.points(np.argwhere(shown).astype(np.float64)))
-        rgb[shown] = believed.vertex_rgb[nearest] / np.float32(255)
+        _, nearest = cKDTree(prior_shape.vertices_m).query(grid.points(np.argwhere(shown).astype(np.float64)))
+        rgb[shown] = prior_shape.vertex_rgb[nearest] / np.float32(255)
         painted = painted | shown
     return replace(filled, sdf_m=np.where(close, distance_m, filled.sdf_m), rgb=_spread(rgb, painted))
 

@@ -47,15 +47,15 @@ def learn_shape(
     config: LearnConfig,
     device: str,
     progress: Progress,
-    believed: ObjectShape | None = None,
+    prior_shape: ObjectShape | None = None,
 ) -> tuple[ObjectShape, int]:
     """The shape of an object in the frame that all tracks share, and how many views it was learned from. Where none of
-    them looks it is the shape `believed` so far, if there is one.
+    them looks it is `prior_shape`, if there is one.
 
     Raises BadInput where no tracked frame shows the object.
     """
     views = chosen_views(tosses, camera, config)
-    trained = train_field(views, config.field, device, progress, believed)
+    trained = train_field(views, config.field, device, progress, prior_shape)
     frame = tosses[0].track.object_frame
     return extract_mesh(trained.field, trained.grid, frame, "neural field"), len(views)
 

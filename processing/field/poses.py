@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from processing.field.network import ObjectField
-from processing.field.rays import RayPool
+from processing.field.rays import RayDataset
 from processing.sensor import noise
 from recordings.constants import LUMA
 
@@ -34,18 +34,18 @@ class PoseConfig:
 
 
 def refine_poses(
-    model: ObjectField, rotation: Tensor, translation: Tensor, pool: RayPool, config: PoseConfig
+    model: ObjectField, rotation: Tensor, translation: Tensor, dataset: RayDataset, config: PoseConfig
 ) -> tuple[Tensor, Tensor, Tensor]:
     """New `camera_from_object` rotations (n, 3, 3), translations (n, 3) and information matrices (n, 6, 6).
 
     The correction acts in object axes about the object's origin: x_object -> x + w x x + t. The mean correction over
     the views is taken out, because the object frame is a free choice.
     """
-    rays = _draw(pool, len(rotation), config.most_pixels)
+    rays = _draw(dataset, len(rotation), config.most_pixels)
     start_rotation, start_translation = rotation, translation
     information = torch.zeros(len(rotation), 6, 6, device=rotation.device)
     for _ in range(config.iterations):
-        information, right = _normal_equations(model, rotation, translation, pool, rays, config)
+        information, right = _normal_equations(model, rotation, translation, dataset, rays, config)
         prior = torch.tensor(
             [config.prior_rotation_rad**-2] * 3 + [config.prior_translation_m**-2] * 3, device=rotation.device
         )
@@ -64,10 +64,10 @@ def _with_gradient(function: Callable[[Tensor], Tensor], points: Tensor) -> tupl
     return values.detach(), gradient
 
 
-def _draw(pool: RayPool, views: int, most: int) -> Tensor:
+def _draw(dataset: RayDataset, views: int, most: int) -> Tensor:
     """Indices of at most `most` rays of each view."""
-    order = torch.randperm(len(pool.view), device=pool.view.device)
-    view = pool.view[order]
+    order = torch.randperm(len(dataset.view), device=dataset.view.device)
+    view = dataset.view[order]
     by_view = torch.argsort(view, stable=True)
     start = torch.searchsorted(view[by_view].contiguous(), torch.arange(views, device=view.device))
     rank = torch.arange(len(by_view), device=view.device) - start[view[by_view]]
@@ -75,11 +75,11 @@ def _draw(pool: RayPool, views: int, most: int) -> Tensor:
 
 
 def _normal_equations(
-    model: ObjectField, rotation: Tensor, translation: Tensor, pool: RayPool, rays: Tensor, config: PoseConfig
+    model: ObjectField, rotation: Tensor, translation: Tensor, dataset: RayDataset, rays: Tensor, config: PoseConfig
 ) -> tuple[Tensor, Tensor]:
-    view = pool.view[rays]
-    direction = pool.direction[rays]
-    in_camera = direction * pool.depth[rays][:, None]
+    view = dataset.view[rays]
+    direction = dataset.direction[rays]
+    in_camera = direction * dataset.depth[rays][:, None]
     points = ((in_camera - translation[view])[:, None, :] @ rotation[view])[:, 0]
     along = (direction[:, None, :] @ rotation[view])[:, 0]
     sdf, sdf_gradient = _with_gradient(lambda x: model.sdf(x), points)
@@ -88,9 +88,9 @@ def _normal_equations(
     on_surface = points - (sdf / facing).clamp(-0.004, 0.004)[:, None] * along
     luma, luma_gradient = _with_gradient(lambda x: model.color(x) @ torch.tensor(LUMA, device=x.device), on_surface)
     luma_gradient = luma_gradient - sdf_gradient * ((luma_gradient * along).sum(-1) / facing)[:, None]
-    seen = pool.rgb[rays] @ torch.tensor(LUMA, device=points.device)
-    depth_sigma = config.depth_sigma_m * (pool.depth[rays] / noise.FIELD_SIGMA_AT_M) ** 2
-    colored = pool.colored[rays]
+    seen = dataset.rgb[rays] @ torch.tensor(LUMA, device=points.device)
+    depth_sigma = config.depth_sigma_m * (dataset.depth[rays] / noise.FIELD_SIGMA_AT_M) ** 2
+    colored = dataset.colored[rays]
     difference = _less_exposure(luma - seen, view, len(rotation), colored)
     information = torch.zeros(len(rotation), 6, 6, device=points.device)
     right = torch.zeros(len(rotation), 6, device=points.device)

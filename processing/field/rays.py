@@ -1,4 +1,4 @@
-"""The pool of rays that the field is trained on, in camera coordinates, so that poses can move."""
+"""The set of rays that the field is trained on, in camera coordinates, so that poses can move."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from processing.field.views import FieldView
 
 
 @dataclass(frozen=True, eq=False)
-class RayPool:
+class RayDataset:
     """`direction` (n, 3) with z = 1, `depth` (n,) metres along z, `plane` (n, 3), `rgb` (n, 3) in 0..1, `view` (n,).
     `colored` (n,) is 1, or 0 where the pixel's colour is not the object's.
 
@@ -29,13 +29,13 @@ class RayPool:
     passing_direction: Tensor
     passing_view: Tensor
 
-    def to(self, device: str) -> RayPool:
-        return RayPool(**{name: getattr(self, name).to(device) for name in self.__dataclass_fields__})
+    def to(self, device: str) -> RayDataset:
+        return RayDataset(**{name: getattr(self, name).to(device) for name in self.__dataclass_fields__})
 
 
-def make_pool(views: Sequence[FieldView]) -> RayPool:
+def make_ray_dataset(views: Sequence[FieldView]) -> RayDataset:
     """All object rays with depth, and all rays that surely pass the object."""
-    parts: dict[str, list[np.ndarray]] = {name: [] for name in RayPool.__dataclass_fields__}
+    parts: dict[str, list[np.ndarray]] = {name: [] for name in RayDataset.__dataclass_fields__}
     for number, view in enumerate(views):
         v, u = np.nonzero(view.depth_m)
         parts["direction"].append(_directions(view, u, v))
@@ -48,7 +48,7 @@ def make_pool(views: Sequence[FieldView]) -> RayPool:
         parts["passing_direction"].append(_directions(view, u, v))
         parts["passing_view"].append(np.full(len(u), number))
     joined = {name: np.concatenate(values) for name, values in parts.items()}
-    return RayPool(
+    return RayDataset(
         **{
             name: torch.tensor(values, dtype=torch.int64 if name.endswith("view") else torch.float32)
             for name, values in joined.items()

@@ -20,7 +20,7 @@ from processing.field.encoding import EncodingName
 from processing.field.fuse import FuseConfig, Grid, fuse
 from processing.field.network import ObjectField
 from processing.field.poses import PoseConfig, refine_poses
-from processing.field.rays import RayPool, make_pool
+from processing.field.rays import RayDataset, make_ray_dataset
 from processing.field.views import FieldView
 from recordings.geometry import nearest_rotation
 from recordings.progress import Progress, Silent
@@ -71,35 +71,35 @@ def train_field(
     config: FieldConfig,
     device: str = "cpu",
     progress: Progress | None = None,
-    believed: ObjectShape | None = None,
+    prior_shape: ObjectShape | None = None,
 ) -> TrainedField:
     """Refine the poses and learn the field of one object. Raises BadInput when the views hold too few depth points.
 
-    `believed`: a shape, in the views' object frame, for what no view sees; without it that is the hull of the rest.
+    `prior_shape`: a shape, in the views' object frame, for what no view sees; without it that is the hull of the rest.
 
     Rounds of fusing and Gauss-Newton come first, because they are cheap; the network is trained once, at the end.
     """
     progress = progress or Silent()
     torch.manual_seed(config.seed)
-    pool = make_pool(views).to(device)
+    dataset = make_ray_dataset(views).to(device)
     information = np.zeros((len(views), 6, 6))
     total = config.pose_rounds + config.steps
     for done in range(config.pose_rounds):
         start = ObjectField(fuse(views, config.fuse), config.encoding).to(device)
-        views, information = refined_views(start, views, pool, config.poses)
+        views, information = refined_views(start, views, dataset, config.poses)
         progress.step(done + 1, total, "field: poses")
-    grid = fuse(views, config.fuse, believed)
+    grid = fuse(views, config.fuse, prior_shape)
     model = ObjectField(grid, config.encoding).to(device)
-    losses = _optimise(model, stack_poses(views, device), pool, config, progress)
+    losses = _optimise(model, stack_poses(views, device), dataset, config, progress)
     return TrainedField(model, grid, tuple(views), information, losses)
 
 
 def refined_views(
-    model: ObjectField, views: Sequence[FieldView], pool: RayPool, config: PoseConfig
+    model: ObjectField, views: Sequence[FieldView], dataset: RayDataset, config: PoseConfig
 ) -> tuple[list[FieldView], Float[Array, "n 6 6"]]:
     """The views with both their poses moved by the correction that the field asks for."""
-    rotation, translation = stack_poses(views, str(pool.depth.device))
-    rotation, translation, information = refine_poses(model, rotation, translation, pool, config)
+    rotation, translation = stack_poses(views, str(dataset.depth.device))
+    rotation, translation, information = refine_poses(model, rotation, translation, dataset, config)
     out = []
     for view, R, t in zip(views, rotation.double().cpu().numpy(), translation.double().cpu().numpy(), strict=True):
         at_depth = np.eye(4)
@@ -110,14 +110,14 @@ def refined_views(
 
 
 def _optimise(
-    model: ObjectField, poses: Poses, pool: RayPool, config: FieldConfig, progress: Progress
+    model: ObjectField, poses: Poses, dataset: RayDataset, config: FieldConfig, progress: Progress
 ) -> tuple[float, ...]:
     optimiser = torch.optim.Adam(_groups(model, config), betas=(0.9, 0.99), fused=True)
     schedule = torch.optim.lr_scheduler.ExponentialLR(optimiser, 0.1 ** (1 / max(config.steps, 1)))
     losses = []
     for step in range(config.steps):
         optimiser.zero_grad(set_to_none=True)
-        loss = total_loss(model, poses, pool, config)
+        loss = total_loss(model, poses, dataset, config)
         loss.backward()
         optimiser.step()
         schedule.step()
@@ -152,39 +152,39 @@ class Samples:
     weight: Tensor
 
 
-def total_loss(model: ObjectField, poses: Poses, pool: RayPool, config: FieldConfig) -> Tensor:
+def total_loss(model: ObjectField, poses: Poses, dataset: RayDataset, config: FieldConfig) -> Tensor:
     """The weighted sum over one random batch; each term is mean-square or mean-absolute in units of the truncation."""
-    device = pool.depth.device
-    chosen = torch.randint(len(pool.depth), (config.rays,), device=device)
-    passing = torch.randint(max(len(pool.passing_view), 1), (config.rays // 4,), device=device)
-    near = near_surface_samples(model, poses, pool, chosen, config.near_samples)
-    free = free_space_samples(model, poses, pool, chosen[: config.rays // 4])
-    beside_m = passing_points(model, poses, pool, passing) if len(pool.passing_view) else near.points_m[:0]
+    device = dataset.depth.device
+    chosen = torch.randint(len(dataset.depth), (config.rays,), device=device)
+    passing = torch.randint(max(len(dataset.passing_view), 1), (config.rays // 4,), device=device)
+    near = near_surface_samples(model, poses, dataset, chosen, config.near_samples)
+    free = free_space_samples(model, poses, dataset, chosen[: config.rays // 4])
+    beside_m = passing_points(model, poses, dataset, passing) if len(dataset.passing_view) else near.points_m[:0]
     around_m = eikonal_points(near.points_m[: config.rays // 2].detach())
-    surface_m = to_object(poses, pool.direction[chosen] * pool.depth[chosen][:, None], pool.view[chosen])
+    surface_m = to_object(poses, dataset.direction[chosen] * dataset.depth[chosen][:, None], dataset.view[chosen])
     parts = [near.points_m, free.points_m, beside_m, around_m]
     distances, rgb = model.sdf_and_color(torch.cat(parts), surface_m)
     at_near, at_free, at_beside, at_around = distances.split([len(p) for p in parts])
     loss = near_surface_loss(at_near, near, model.truncation_m)
     loss = loss + config.free_weight * free_space_loss(at_free, free, model.truncation_m)
-    loss = loss + config.color_weight * ((rgb - pool.rgb[chosen]).abs() * pool.colored[chosen, None]).mean()
+    loss = loss + config.color_weight * ((rgb - dataset.rgb[chosen]).abs() * dataset.colored[chosen, None]).mean()
     if len(beside_m):
         inside = inside_only(model, beside_m, at_beside)
         loss = loss + config.passing_weight * passing_loss(inside, model.truncation_m)
     return loss + config.eikonal_weight * eikonal_loss(at_around)
 
 
-def near_surface_samples(model: ObjectField, poses: Poses, pool: RayPool, chosen: Tensor, each: int) -> Samples:
+def near_surface_samples(model: ObjectField, poses: Poses, dataset: RayDataset, chosen: Tensor, each: int) -> Samples:
     """Points within the truncation of the measured surface and their distance to the pixel's plane,
     (1 - n . x) / |n|."""
     rays = chosen.repeat_interleave(each)
-    direction, depth, plane = pool.direction[rays], pool.depth[rays], pool.plane[rays]
+    direction, depth, plane = dataset.direction[rays], dataset.depth[rays], dataset.plane[rays]
     along = (torch.rand(len(rays), device=depth.device) * 2 - 1) * model.truncation_m
     in_camera = direction * (depth + along / direction.norm(dim=-1))[:, None]
     target = (1 - (plane * in_camera).sum(-1)) / plane.norm(dim=-1)
     behind = torch.where(target < 0, 1 + target / model.truncation_m, torch.ones_like(target)).clamp(0.05)
-    sharp = (pool.depth.median() / depth) ** 4
-    return Samples(to_object(poses, in_camera, pool.view[rays]), target, behind * sharp.clamp(max=4))
+    sharp = (dataset.depth.median() / depth) ** 4
+    return Samples(to_object(poses, in_camera, dataset.view[rays]), target, behind * sharp.clamp(max=4))
 
 
 def near_surface_loss(distance_m: Tensor, wanted: Samples, truncation_m: float) -> Tensor:
@@ -194,15 +194,15 @@ def near_surface_loss(distance_m: Tensor, wanted: Samples, truncation_m: float) 
     return (wanted.weight * huber).mean()
 
 
-def free_space_samples(model: ObjectField, poses: Poses, pool: RayPool, chosen: Tensor) -> Samples:
+def free_space_samples(model: ObjectField, poses: Poses, dataset: RayDataset, chosen: Tensor) -> Samples:
     """Points well before the surface and the least distance there."""
-    direction, depth = pool.direction[chosen], pool.depth[chosen]
+    direction, depth = dataset.direction[chosen], dataset.depth[chosen]
     before = model.truncation_m * (1.5 + 4 * torch.rand(len(chosen), device=depth.device))
     in_camera = direction * (depth - before / direction.norm(dim=-1))[:, None]
-    plane = pool.plane[chosen]
+    plane = dataset.plane[chosen]
     distance = (1 - (plane * in_camera).sum(-1)) / plane.norm(dim=-1)
     wanted = distance.clamp(0, model.truncation_m)
-    return Samples(to_object(poses, in_camera, pool.view[chosen]), wanted, torch.ones_like(wanted))
+    return Samples(to_object(poses, in_camera, dataset.view[chosen]), wanted, torch.ones_like(wanted))
 
 
 def free_space_loss(distance_m: Tensor, wanted: Samples, truncation_m: float) -> Tensor:
@@ -214,13 +214,13 @@ PASSING_SAMPLES = 8
 """Points looked at on a ray that passes the object."""
 
 
-def passing_points(model: ObjectField, poses: Poses, pool: RayPool, chosen: Tensor) -> Tensor:
+def passing_points(model: ObjectField, poses: Poses, dataset: RayDataset, chosen: Tensor) -> Tensor:
     """Points on rays beside the mask, where they cross the box of the object."""
-    view = pool.passing_view[chosen]
+    view = dataset.passing_view[chosen]
     centre = poses[1][view] + (poses[0][view] @ (model.low + model.size / 2)[:, None])[..., 0]
     reach, k = model.size.norm() / 2, PASSING_SAMPLES
     steps = (torch.arange(k, device=view.device) + torch.rand(len(chosen), 1, device=view.device)) / k * 2 - 1
-    in_camera = pool.passing_direction[chosen][:, None, :] * (centre[:, 2:3] + reach * steps)[..., None]
+    in_camera = dataset.passing_direction[chosen][:, None, :] * (centre[:, 2:3] + reach * steps)[..., None]
     return to_object(poses, in_camera.reshape(-1, 3), view.repeat_interleave(k))
 
 

@@ -17,13 +17,13 @@ class MotionConfig:
     """What counts as a usual change of motion from frame to frame."""
 
     usual_turn_rad_s: float = 6.0
-    """Change of spin between two frames that costs half of an impact's price."""
+    """Change of spin between two frames that costs half of `impact_cost`."""
     impact_cost: float = 0.12
-    """Price of a change of spin, however large: an impact may do anything."""
+    """Cost of a change of spin, however large: an impact may do anything."""
     fast_turn_rad_s: float = 28.0
-    """Spins above this are dearer still (an alias of a symmetric body is a fast spin)."""
+    """Spins above this cost still more (an alias of a symmetric body is a fast spin)."""
     usual_shift_m_s: float = 0.6
-    """Change of velocity, beyond gravity, that costs half of the price below."""
+    """Change of velocity, beyond gravity, that costs half of `shift_cost`."""
     shift_cost: float = 0.04
 
 
@@ -50,7 +50,7 @@ def change_cost(
     config: MotionConfig,
     spin_rad_s: Float[Array, "3"] | None = None,
 ) -> float:
-    """Price of the change of motion over three poses, at most impact_cost + shift_cost (and more for very fast spins).
+    """Cost of the change of motion over three poses, at most impact_cost + shift_cost (and more for very fast spins).
 
     Zero for a body in free flight with constant spin, and (but for gravity's share) for one at rest. `spin_rad_s`
     (camera axes) is the spin before, where it is known better than from the first two poses.

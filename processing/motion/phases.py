@@ -1,6 +1,6 @@
 """Phases of a toss from its track alone: in hand, flight, contact, rest.
 
-The frames are cut into segments so that the sum of their misfits plus a price per segment is least (dynamic
+The frames are cut into segments so that the sum of their misfits plus a cost per segment is least (dynamic
 programming). A segment is ballistic (free position and velocity, gravity given, torque-free spin) or at rest (one
 pose).
 What neither fits falls apart into single frames: contact, or a hand.
@@ -17,7 +17,7 @@ from numpy import ndarray as Array
 from processing.motion.trajectory import PoseSeries, differences, rotation_vectors
 from recordings.constants import GRAVITY_M_S2, MAD_TO_SIGMA
 
-SEGMENT_PRICE = 30.0
+SEGMENT_COST = 30.0
 """Misfit (chi squared) that one more segment must save."""
 FLIGHT_FRAMES = 3
 """A shorter ballistic segment proves nothing."""
@@ -141,14 +141,14 @@ def find_phases(series: PoseSeries, inertia: Float[Array, "3 3"], noise: Noise |
 
 
 def _cheapest(costs: dict[str, Float[Array, "n n"]]) -> list[Segment]:
-    """The cut with the least total cost, one price per segment."""
+    """The cut with the least total cost, one cost per segment."""
     kinds = list(costs)
     n = len(next(iter(costs.values())))
     best = np.concatenate([[0.0], np.full(n, np.inf)])
     back: list[tuple[int, str]] = [(0, "")] * (n + 1)
     for j in range(n):
         for kind in kinds:
-            total = best[: j + 1] + costs[kind][: j + 1, j] + SEGMENT_PRICE
+            total = best[: j + 1] + costs[kind][: j + 1, j] + SEGMENT_COST
             i = int(total.argmin())
             if total[i] < best[j + 1]:
                 best[j + 1], back[j + 1] = total[i], (i, kind)

@@ -1,4 +1,4 @@
-"""How well a shape at its poses explains the raw images: the evidence by which passes are compared without truth.
+"""How well a shape at its poses explains the raw images: the residuals by which passes are compared without truth.
 
 A reprojected depth agrees with the poses it was drawn from by making, so only what the camera measured counts: raw
 depth inside the first masks, the outline of those masks, and the picture's own colours.
@@ -39,7 +39,7 @@ class JudgeConfig:
 
 
 @dataclass(frozen=True)
-class Evidence:
+class MeanResiduals:
     """Means over the frames looked at (`frames`): absolute depth residual (m), 1 - IoU of the outline, colour residual
     (grey levels of 255, after each frame's own light; NaN without colours). `lost`: frames without a pose."""
 
@@ -60,13 +60,13 @@ class Explained:
     rows: Float[Array, "n 5"]
     lost: int
 
-    def evidence(self) -> Evidence:
+    def means(self) -> MeanResiduals:
         if len(self.rows) == 0:
-            return Evidence(float("nan"), float("nan"), float("nan"), 0, self.lost)
+            return MeanResiduals(float("nan"), float("nan"), float("nan"), 0, self.lost)
         with np.errstate(all="ignore"):
             color = self.rows[:, 4][np.isfinite(self.rows[:, 4])]
         depth_m, mask = self.rows[:, 2].mean(), self.rows[:, 3].mean()
-        return Evidence(
+        return MeanResiduals(
             float(depth_m), float(mask), float(color.mean()) if len(color) else float("nan"), len(self.rows), self.lost
         )
 

@@ -1,7 +1,7 @@
 """`joint`: one objective over shape, poses and friction, beyond the paper's alternation.
 
 E = sum of squares of residuals, each divided by its measured noise, over
-  views      the tracker's objective over depth, looks and outline of all pairs of views, in its quadratic form,
+  views      the tracker's objective over depth, appearance and outline of all pairs of views, in its quadratic form,
   depth      raw depth points against the surface (signed distance along the normal), robust,
   flight     change of velocity against gravity, change of spin against none, for every three frames of free flight,
   rest       motion from frame to frame at rest,

@@ -134,7 +134,7 @@ def views_block(
     frame: int, begun: Float[Array, "4 4"], camera_from_object: Float[Array, "4 4"], covariance: Float[Array, "6 6"],
     center_m: Float[Array, "3"],
 ) -> Block:  # fmt: skip
-    """What the tracker's own objective (depth, looks and outline of every pair of views) says about a pose, in its
+    """What the tracker's own objective (depth, appearance and outline of every pair of views) says about a pose, in its
     quadratic form about where it ended: the deviation from there, whitened by the covariance there."""
     change = np.linalg.inv(begun) @ camera_from_object
     deviation = np.concatenate([rotation_log(change[:3, :3]), change[:3, :3] @ center_m + change[:3, 3] - center_m])

@@ -25,15 +25,15 @@ class FieldResult:
 
 
 def learn_field(
-    run: Run, name: str, tracks: Mapping[int, Done], images: Mapping[int, Images], believed: Done | None = None
+    run: Run, name: str, tracks: Mapping[int, Done], images: Mapping[int, Images], prior_shape: Done | None = None
 ) -> Done[FieldResult]:
-    """O. Where no frame looks it is the shape `believed` so far, if there is one (else the hull of what was seen)."""
+    """O. Where no frame looks it is the shape `prior_shape`, if there is one (else the hull of what was seen)."""
     inputs = {"for": name, **track_and_image_keys(tracks, images)}
-    inputs |= {} if believed is None else {"believed": believed.key}
+    inputs |= {} if prior_shape is None else {"believed": prior_shape.key}  # the name that stored keys were made with
 
     def compute(folder: Path) -> FieldResult:
         views = [images[t].open().views(read_track(done.folder, t)) for t, done in tracks.items()]
-        body = None if believed is None else read_shape(believed.folder)
+        body = None if prior_shape is None else read_shape(prior_shape.folder)
         progress = run.progress(f"{name}: shape")
         shape, used = learn_shape(views, run.camera, run.config.shape, run.device, progress, body)
         write_shape(folder, shape)

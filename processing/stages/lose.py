@@ -41,8 +41,8 @@ def without_lost(run: Run, masks: Mapping[int, Done[SegmentResult]]) -> Run:
     if not why:
         return run
     if len(why) == len(run.tosses):
-        told = "; ".join(f"toss {t}: {reason}" for t, reason in why.items())
-        raise BadInput(f"{run.session.path}: no toss can be tracked ({told}). Look at the masks with `toss-view`")
+        listed = "; ".join(f"toss {t}: {reason}" for t, reason in why.items())
+        raise BadInput(f"{run.session.path}: no toss can be tracked ({listed}). Look at the masks with `toss-view`")
     warnings = tuple(
         Notice("masks", "high", f"toss {t}: {reason}: lost, and left out of everything else", SEE)
         for t, reason in why.items()

@@ -16,7 +16,7 @@ import numpy as np
 from processing.run import CAMERA, Run
 from processing.segment.background.depth_scale import TableScale, accepted_scale, table_scale
 from processing.segment.background.static_scene import StaticScene
-from processing.segment.robot.fit import RobotFit, Sight, choose_sights, fit_robot
+from processing.segment.robot.fit import RobotFit, RobotObservation, choose_observations, fit_robot
 from processing.segment.robot.of_session import RobotOfSession
 from processing.store import Done
 from recordings.geometry import Transform
@@ -84,11 +84,11 @@ def _fit(run: Run, robot: RobotOfSession, scene: StaticScene, table: TableScale 
         early, late = (path.links(at + d)[PANDA_TOOL].translation_m for d in (-HALF_STEP_NS, HALF_STEP_NS))
         return float(np.linalg.norm(late - early) / (2e-9 * HALF_STEP_NS))
 
-    chosen = choose_sights([len(s) for s in streams], speed, run.config.rig.robot)
-    sights = [Sight(streams[t][i], path) for t, i in chosen if (path := paths[t]) is not None]
+    chosen = choose_observations([len(s) for s in streams], speed, run.config.rig.robot)
+    observations = [RobotObservation(streams[t][i], path) for t, i in chosen if (path := paths[t]) is not None]
     camera, progress = run.camera, run.progress("robot")
     prior = None if table is None else (table.scale, table.sigma)
-    return fit_robot(sights, camera, robot.camera_from_base, scene, run.config.rig.robot, prior, progress.step)
+    return fit_robot(observations, camera, robot.camera_from_base, scene, run.config.rig.robot, prior, progress.step)
 
 
 def _scale(fit: RobotFit | None, table: TableScale | None) -> tuple[float, float]:

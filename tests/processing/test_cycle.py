@@ -126,7 +126,7 @@ def test_a_worse_pose_explains_the_raw_images_worse(tiny_world: Any, error: np.n
     poses = np.stack([(tiny_world.world_from_camera.inverse() @ p).matrix for p in world_poses])
     frames, masks = [f for f, _ in seen], [m for _, m in seen]
     true, wrong = (
-        explain(box_shape(), track_of(p), frames, masks, tiny_world.camera, JudgeConfig(every=1)).evidence()
+        explain(box_shape(), track_of(p), frames, masks, tiny_world.camera, JudgeConfig(every=1)).means()
         for p in (poses, poses @ error)
     )
     assert true.frames == wrong.frames == 4
@@ -145,7 +145,7 @@ def test_colours_are_compared_after_the_light_on_each_face(tiny_world: Any) -> N
     shown = replace(frame, color_rgb=np.repeat(lit[..., None], 3, -1).astype(np.uint8))
     found = explain(
         box_shape(), track_of(camera_from_object[None]), [shown], [mask], tiny_world.camera, JudgeConfig(every=1)
-    ).evidence()
+    ).means()
     assert found.color < 1.0
     assert len(np.unique(lit[drawn.depth_m > 0].round())) > 1
 
@@ -162,7 +162,7 @@ def test_a_lost_frame_counts_as_lost_and_never_as_explained(tiny_world: Any) -> 
         [m for _, m in seen],
         tiny_world.camera,
         JudgeConfig(every=1),
-    ).evidence()
+    ).means()
     assert (found.frames, found.lost) == (3, 1)
 
 

@@ -19,7 +19,7 @@ from processing.evaluate.report import write_report
 from processing.evaluate.report_loops import SLOWED, chosen_frames, flight_cut, loop_images, toss_loops
 from processing.evaluate.report_mesh import MOST_FACES, thinned
 from processing.evaluate.report_shapes import UNSEEN_RGB, Shown
-from processing.evaluate.report_worst import Evidence, lost_runs, reasons, worst_frames
+from processing.evaluate.report_worst import TossDiagnostics, lost_runs, reasons, worst_frames
 from processing.evaluate.score import TossScore, VariantScore
 from processing.evaluate.table import Row, table_document
 from recordings.film.film import STATUS_RGB
@@ -224,7 +224,7 @@ def test_a_reason_names_what_is_unusual_and_nothing_else(made, name, value, said
     track = made[1].tracks[0]
     usual = {"residual": 0.1, "on_surface": 0.9, "mask_px": 900.0, "mask_confidence": 0.9, "at_edge": 0.0}
     arrays = {k: np.full(FRAMES, v) for k, v in usual.items()}
-    calm = Evidence(track, np.full(FRAMES, np.nan), np.full(FRAMES, np.nan), **arrays)
+    calm = TossDiagnostics(track, np.full(FRAMES, np.nan), np.full(FRAMES, np.nan), **arrays)
     assert reasons(calm, 1) == ("nothing that was measured is unusual in it",)
     arrays[name][1] = value
     assert len(found := reasons(calm, 1)) == 1

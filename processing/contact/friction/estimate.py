@@ -23,7 +23,7 @@ from jaxtyping import Float
 from numpy import ndarray as Array
 from scipy.stats import t as student
 
-from processing.contact.friction.forecast import Course, Forecasts, Law, RigidBody
+from processing.contact.friction.forecast import Forecasts, Law, ObservedTrajectory, RigidBody
 from processing.motion.phases import Noise
 from processing.motion.smoother import Smoothed
 from processing.motion.trajectory import PoseSeries
@@ -72,10 +72,10 @@ def friction_by_forecasts(
     body: RigidBody, tracks: Sequence[PoseSeries], smoothed: Sequence[Smoothed], seed: int = 0
 ) -> ForecastFriction | None:
     """Friction of a body of known shape. None where fewer than LEAST_TOSSES tosses hit the plane."""
-    courses = courses_of(tracks, smoothed)
-    if len(courses) < LEAST_TOSSES:
+    trajectories = observed_trajectories(tracks, smoothed)
+    if len(trajectories) < LEAST_TOSSES:
         return None
-    forecasts = Forecasts(courses, body, noise_of(smoothed))
+    forecasts = Forecasts(trajectories, body, noise_of(smoothed))
     law = _search(forecasts)
     tried = np.exp(np.log(law.friction) + PROFILE)
     profile = forecasts.scores([replace(law, friction=float(f)) for f in tried])
@@ -88,9 +88,9 @@ def friction_by_forecasts(
     return ForecastFriction(value, half_width, law, rebound, profile)
 
 
-def courses_of(tracks: Sequence[PoseSeries], smoothed: Sequence[Smoothed]) -> list[Course]:
+def observed_trajectories(tracks: Sequence[PoseSeries], smoothed: Sequence[Smoothed]) -> list[ObservedTrajectory]:
     """At most MOST_TOSSES of the tosses that hit anything, spread over all."""
-    found = [course for t, s in zip(tracks, smoothed) if (course := _course(t, s)) is not None]
+    found = [trajectory for t, s in zip(tracks, smoothed) if (trajectory := _observed_trajectory(t, s)) is not None]
     if not found:
         return []
     return [found[i] for i in np.unique(np.linspace(0, len(found) - 1, MOST_TOSSES).round().astype(int))]
@@ -101,15 +101,15 @@ def noise_of(smoothed: Sequence[Smoothed]) -> Noise:
     return Noise(*(float(np.median([getattr(s.noise, n) for s in smoothed])) for n in ("position_m", "rotation_rad")))
 
 
-def _course(track: PoseSeries, smoothed: Smoothed) -> Course | None:
+def _observed_trajectory(track: PoseSeries, smoothed: Smoothed) -> ObservedTrajectory | None:
     """From the release to just behind the beginning of the rest, where it hits anything."""
     phases = smoothed.phases
     if phases.release is None or phases.first_impact is None:
         return None
     kept = slice(phases.release, len(track) if phases.rest is None else phases.rest + 2)
     flight = phases.first_impact - phases.release
-    course = Course(track.time_s[kept], track.rotation[kept], track.position_m[kept], flight)
-    return course if len(course.time_s) >= max(LEAST_FRAMES, flight + 1) else None
+    trajectory = ObservedTrajectory(track.time_s[kept], track.rotation[kept], track.position_m[kept], flight)
+    return trajectory if len(trajectory.time_s) >= max(LEAST_FRAMES, flight + 1) else None
 
 
 def _search(forecasts: Forecasts) -> Law:

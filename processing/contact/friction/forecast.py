@@ -1,11 +1,11 @@
 """Forecasts of tosses under laws of contact, and how far off they are by a proper score.
 
-A single rollout from the release ends in chaos, and until when it is believed decides the friction found. So it is not
-one: what is known of the state before the first impact (a sigma-point Kalman filter on SE(3) through the flight:
-Julier and Uhlmann 1997) becomes an ensemble of 24 states, all of which are rolled on in steps of STEP_S to the rest.
-What rigid bodies, Coulomb's and Newton's laws leave unexplained is a Law's `unexplained`: after each frame every member
-is kicked at random by that share of its speed change by contact. A frame's forecast x_1 .. x_s of what is seen, y, is
-judged by the energy score (Gneiting and Raftery 2007):
+A single rollout from the release ends in chaos, and the horizon up to which it is compared decides the friction found.
+So it is not one: the state before the first impact (a sigma-point Kalman filter on SE(3) through the flight: Julier and
+Uhlmann 1997) becomes an ensemble of 24 states, all of which are rolled on in steps of STEP_S to the rest. What rigid
+bodies, Coulomb's and Newton's laws leave unexplained is a Law's `unexplained`: after each frame every member is kicked
+at random by that share of its speed change by contact. A frame's forecast x_1 .. x_s of what is seen, y, is judged by
+the energy score (Gneiting and Raftery 2007):
 
     ES = mean_i |x_i - y| - 1/2 mean_ij |x_i - x_j|
 
@@ -45,7 +45,7 @@ class Law:
 
 
 @dataclass(frozen=True, eq=False)
-class Course:
+class ObservedTrajectory:
     """The poses of one toss from the release on (of the centre of mass, the plane at z = 0); `flight` counts those
     before the first impact."""
 
@@ -98,30 +98,32 @@ DRAWN = np.concatenate([_half, -_half], 1)
 class Forecasts:
     """Tosses ready to be forecast under one law after another."""
 
-    def __init__(self, courses: Sequence[Course], body: RigidBody, noise: Noise, reach_m: float | None = None) -> None:
+    def __init__(
+        self, trajectories: Sequence[ObservedTrajectory], body: RigidBody, noise: Noise, reach_m: float | None = None
+    ) -> None:
         """`reach_m`: the lever of turns in scores, where bodies of several sizes are to be compared by them."""
         self.body, self.noise = body, noise
         self.reach_m = body.reach_m if reach_m is None else reach_m
-        before = [self._before_impact(c) for c in courses]
+        before = [self._before_impact(c) for c in trajectories]
         self._start = [np.concatenate([p[i] for p in before]) for i in range(4)]
-        first = [max(c.flight - 1, 1) for c in courses]
-        self.courses = [
-            Course(c.time_s[f:LONGEST], c.rotation[f:LONGEST], c.position_m[f:LONGEST], 0)
-            for c, f in zip(courses, first)
+        first = [max(c.flight - 1, 1) for c in trajectories]
+        self.trajectories = [
+            ObservedTrajectory(c.time_s[f:LONGEST], c.rotation[f:LONGEST], c.position_m[f:LONGEST], 0)
+            for c, f in zip(trajectories, first)
         ]
         self._scale_m: Float[Array, "n k"] | None = None
 
-    def _before_impact(self, course: Course) -> list[Float[Array, "1 s ..."]]:
+    def _before_impact(self, trajectory: ObservedTrajectory) -> list[Float[Array, "1 s ..."]]:
         """Members of the state at the last frame of the flight, from all frames up to it."""
-        last, body = max(course.flight - 1, 1), self.body
+        last, body = max(trajectory.flight - 1, 1), self.body
         sigma = np.array([[self.noise.rotation_rad, self.noise.position_m]])
-        states = _first_states([course], body, sigma)
+        states = _first_states([trajectory], body, sigma)
         none = np.zeros((1, 2))
         for k in range(2, last + 1):
-            dt = np.diff(course.time_s[k - 1 : k + 1])
+            dt = np.diff(trajectory.time_s[k - 1 : k + 1])
             ahead = _predicted(states, dt, body, none)
             _disturb(ahead.covariance, dt)
-            states = _corrected(ahead, course.rotation[k : k + 1], course.position_m[k : k + 1], sigma)
+            states = _corrected(ahead, trajectory.rotation[k : k + 1], trajectory.position_m[k : k + 1], sigma)
         return [p[0] for p in _members(states)]
 
     def scores(self, laws: Sequence[Law]) -> Float[Array, "m n"]:
@@ -136,16 +138,16 @@ class Forecasts:
         """Energy score and mean distance in metres, per law, toss and frame; 0 where a toss has ended."""
         laws = np.array([[w.friction, w.restitution, w.unexplained] for w in wanted])
         parts = [np.repeat(p[None], len(laws), 0) for p in self._start]
-        longest = max(len(c.time_s) for c in self.courses)
-        energy, off = (np.zeros((len(laws), len(self.courses), longest)) for _ in range(2))
+        longest = max(len(c.time_s) for c in self.trajectories)
+        energy, off = (np.zeros((len(laws), len(self.trajectories), longest)) for _ in range(2))
         for k in range(1, longest):
-            going = [j for j, c in enumerate(self.courses) if k < len(c.time_s)]
-            dt = np.array([self.courses[j].time_s[k] - self.courses[j].time_s[k - 1] for j in going])
+            going = [j for j, c in enumerate(self.trajectories) if k < len(c.time_s)]
+            dt = np.array([self.trajectories[j].time_s[k] - self.trajectories[j].time_s[k - 1] for j in going])
             moved, push = _rolled([p[:, going] for p in parts], dt, self.body, laws[:, :2])
             self._kick(moved, laws[:, 2, None, None] * push, dt, k)
             for whole, part in zip(parts, moved):
                 whole[:, going] = part
-            seen = [self.courses[j] for j in going]
+            seen = [self.trajectories[j] for j in going]
             energy[:, going, k], off[:, going, k] = self._judged(moved, seen, k)
         return energy, off
 
@@ -157,7 +159,7 @@ class Forecasts:
         parts[3][...] += kick[..., :3]
 
     def _judged(
-        self, parts: Sequence[Array], seen: Sequence[Course], k: int
+        self, parts: Sequence[Array], seen: Sequence[ObservedTrajectory], k: int
     ) -> tuple[Float[Array, "m a"], Float[Array, "m a"]]:
         """Energy score and mean distance of members (seen with the poses' noise) from what was seen."""
         turned = rotation_matrices(self.noise.rotation_rad * DRAWN[k, :, 6:9])
@@ -187,12 +189,12 @@ def _members(states: _States) -> list[Array]:
     ]
 
 
-def _first_states(courses: Sequence[Course], body: RigidBody, sigma: Float[Array, "m 2"]) -> _States:
+def _first_states(trajectories: Sequence[ObservedTrajectory], body: RigidBody, sigma: Float[Array, "m 2"]) -> _States:
     """The state at each toss's second frame, from its first two: v = (p1 - p0) / dt, moved to the end of the step."""
-    m, n = len(sigma), len(courses)
+    m, n = len(sigma), len(trajectories)
     shapes = ((m, n, 3, 3), (m, n, 3), (m, n, 3), (m, n, 3), (m, n, 12, 12))
     states = _States(*(np.zeros(shape) for shape in shapes))
-    for j, c in enumerate(courses):
+    for j, c in enumerate(trajectories):
         dt = float(c.time_s[1] - c.time_s[0])
         spin = rotation_vectors(c.rotation[0].T @ c.rotation[1]) / dt
         turning = -np.linalg.solve(body.inertia_kgm2, np.cross(spin, body.inertia_kgm2 @ spin))

@@ -1,7 +1,7 @@
 """How high the plane is where frames are far apart: the height at which a box of the fitting size is forecast best.
 
-At camera rates no frame shows what the plane carries (touch.py needs 100 Hz), but what happens between frames is told
-by the courses: of two boxes that rest at the same height, the one that is larger by as much as its plane is lower
+At camera rates no frame shows what the plane carries (touch.py needs 100 Hz), but the trajectories show what happens
+between frames: of two boxes that rest at the same height, the one that is larger by as much as its plane is lower
 strikes with its corners sooner. So the box is kept at its resting height while plane and size are moved together, and
 forecasts (forecast.py) under the law that was found are scored. Rounded edges read as in touch.py: higher by the
 radius.
@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray as Array
 
-from processing.contact.friction.estimate import courses_of, lowest, noise_of
+from processing.contact.friction.estimate import lowest, noise_of, observed_trajectories
 from processing.contact.friction.forecast import Forecasts, Law, RigidBody
 from processing.contact.learn.data_checks import lowest_point_m
 from processing.contact.learn.touch import TouchedPlane
@@ -37,12 +37,12 @@ def plane_by_forecasts(
     """The plane of a box (corners about the centre of mass) by its tosses. None where nothing rests."""
     resting = [lowest_point_m(t, box.points_m, s.phases) for t, s in zip(tracks, smoothed)]
     heights = [h for h in resting if h is not None]
-    courses = courses_of(tracks, smoothed)
-    if not heights or len(courses) < 2:
+    trajectories = observed_trajectories(tracks, smoothed)
+    if not heights or len(trajectories) < 2:
         return None
     noise, rest_m, energies = noise_of(smoothed), float(np.median(heights)), []
     for height_m in HEIGHTS_M:
-        lowered = [replace(c, position_m=c.position_m - [0.0, 0.0, height_m]) for c in courses]
+        lowered = [replace(c, position_m=c.position_m - [0.0, 0.0, height_m]) for c in trajectories]
         body = replace(box, points_m=_larger(box.points_m, rest_m - float(height_m)))
         energies.append(Forecasts(lowered, body, noise, box.reach_m).energies([law]))
     scale_m = np.maximum(np.mean([off[0] for _, off in energies], axis=0), noise.position_m)

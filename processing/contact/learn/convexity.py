@@ -125,9 +125,9 @@ def _tested_choice(
         each = losses_of(prepared, points, found.friction.value, found.fitted.inertia_start_kgm2)
         losses[name] = np.array([x.loss_j for x in each.values()])
     worse = losses["nonconvex"] - losses["hull"]
-    doubt = float(worse.std(ddof=1)) / len(worse) ** 0.5 if len(worse) > 1 else 0.0
+    standard_error = float(worse.std(ddof=1)) / len(worse) ** 0.5 if len(worse) > 1 else 0.0
     means = {k: float(v.mean()) for k, v in losses.items()}
-    if float(worse.mean()) > 2 * doubt and float(worse.mean()) > 0.02 * means["hull"]:
+    if float(worse.mean()) > 2 * standard_error and float(worse.mean()) > 0.02 * means["hull"]:
         return GeometryChoice("hull", empty, "the union of pieces explains held-out tosses worse than its hull", means)
     return GeometryChoice(
         "nonconvex", empty, f"the mesh leaves {100 * empty:.0f} % of its hull empty, and contact does not object", means

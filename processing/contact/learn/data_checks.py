@@ -336,14 +336,14 @@ def duplicate_groups(tosses: Sequence[PoseSeries]) -> list[tuple[int, ...]]:
     for i, a in enumerate(tosses):
         if a.toss in taken:
             continue
-        same = [b.toss for b in tosses[i + 1 :] if b.toss not in taken and _same_course(a, b)]
+        same = [b.toss for b in tosses[i + 1 :] if b.toss not in taken and _same_motion(a, b)]
         if same:
             groups.append((a.toss, *same))
             taken.update(groups[-1])
     return groups
 
 
-def _same_course(a: PoseSeries, b: PoseSeries) -> bool:
+def _same_motion(a: PoseSeries, b: PoseSeries) -> bool:
     n = min(len(a), len(b), SAME_FRAMES)
     higher = np.abs(a.position_m[:n, 2] - b.position_m[:n, 2]).max()
     return bool(higher < SAME_HEIGHT_M and np.abs(a.rotation[:n, 2] - b.rotation[:n, 2]).max() < SAME_TILT)

@@ -78,7 +78,7 @@ def sweep_weights(
     steps: Steps,
     held_out: HeldOut,
     config: SweepConfig,
-    told: Callable[[int, int], None] = lambda done, total: None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
     base: Weights | None = None,
 ) -> Sweep:
     """Search the grid: the first candidates, then those beside the best until no better neighbour is left."""
@@ -90,7 +90,7 @@ def sweep_weights(
         near = min(found, key=lambda c: abs(np.log(c.dissipation / todo[0])), default=None)
         begin = model.start() if near is None else near.fit.parameters
         found.append(_try(model, steps, held_out, config, todo.pop(0), begin, near is None, base))
-        told(len(found), len(grid))
+        progress(len(found), len(grid))
         if len(found) == 1:
             points = model.numbers(found[0].fit.parameters).points_m
             reach_m = 0.5 * float((points.amax(0) - points.amin(0)).mean())

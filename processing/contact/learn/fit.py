@@ -7,7 +7,6 @@ lengths in SCALE_M.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -196,7 +195,6 @@ def fit_adam(
     weights: Weights,
     iterations: int,
     rate: float,
-    told: Callable[[int, float], None] | None = None,
 ) -> Fit:
     """Full-batch Adam (Kingma and Ba 2015) with a cosine schedule: free points make the loss too kinked for L-BFGS."""
     objective = _Objective(model, start, data, weights)
@@ -211,8 +209,6 @@ def fit_adam(
         step = (mean / (1 - 0.9 ** (i + 1))) / ((square / (1 - 0.999 ** (i + 1))).sqrt() + 1e-8)
         with torch.no_grad():
             objective.free.sub_(now * step)
-        if told is not None:
-            told(i, loss / LOSS_SCALE)
     return objective.ended(objective.free.detach().cpu().numpy(), loss)
 
 

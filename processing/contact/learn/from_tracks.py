@@ -53,7 +53,7 @@ NEAR_M = 0.005
 
 @dataclass(frozen=True)
 class TracksConfig:
-    """Everything that learning from vision's tracks can be told."""
+    """The settings of contact learning from vision's tracks."""
 
     contact: ContactConfig = field(default_factory=lambda: ContactConfig(bootstrap_repeats=12, penetration=20.0))
     geometry: ClassName | None = None

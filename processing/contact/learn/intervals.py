@@ -9,7 +9,6 @@ one contact lasts several (Newey and West 1987), the covariance is H^-1 G H^-1 (
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -80,18 +79,16 @@ def bootstrap(
     repeats: int,
     seed: int,
     share: float = 0.12,
-    told: Callable[[int, int], None] = lambda done, total: None,
 ) -> Spread:
     """Repeat the fit on tosses drawn with replacement."""
     rng = np.random.default_rng(seed)
     tosses, owner = np.unique(data.steps.toss, return_inverse=True)
     drawn = []
-    for i in range(repeats):
+    for _ in range(repeats):
         counts = rng.multinomial(len(tosses), np.full(len(tosses), 1 / len(tosses)))
         part = data.rows(torch.arange(len(data), device=data.weight.device))
         part.weight = data.weight * torch.as_tensor(counts[owner], dtype=torch.float64, device=data.weight.device)
         drawn.append(fit(model, optimum, part, weights, share).parameters)
-        told(i + 1, repeats)
     values = np.array(drawn)
     # n / (n - 1): drawing with replacement narrows the spread of small samples
     width = float(student.ppf(0.975, max(len(tosses) - 1, 1))) * (len(tosses) / max(len(tosses) - 1, 1)) ** 0.5

@@ -33,7 +33,7 @@ from recordings.tracks import ContactModel, ObjectShape
 
 @dataclass(frozen=True)
 class ContactConfig:
-    """Everything that contact learning can be told."""
+    """The settings of contact learning."""
 
     fit: FitConfig = field(default_factory=FitConfig)
     sweep: SweepConfig = field(default_factory=SweepConfig)

@@ -68,7 +68,7 @@ class RobotFitSettings:
 
 
 @dataclass(frozen=True, eq=False)
-class Sight:
+class RobotObservation:
     """One frame of a session and the arm's path in its toss."""
 
     frame: RgbdFrame
@@ -136,7 +136,7 @@ class _Edges:
     reach_px: float
 
 
-def choose_sights(
+def choose_observations(
     counts: Sequence[int], speed: Callable[[int, int], float], settings: RobotFitSettings
 ) -> list[tuple[int, int]]:
     """(toss position, frame) to look at. `speed(toss, frame)` is the tool's in m/s; NaN where joints are not known."""
@@ -149,7 +149,7 @@ def choose_sights(
 
 
 def fit_robot(
-    sights: Sequence[Sight],
+    observations: Sequence[RobotObservation],
     camera: CameraModel,
     camera_from_base: Transform,
     scene: StaticScene,
@@ -160,20 +160,20 @@ def fit_robot(
     """Refine the robot's place, its delay and the depth's scale. `scale_prior`: what else is known of the scale, and
     its standard deviation."""
     start = _State(camera_from_base)
-    if not sights:
+    if not observations:
         return _refused(start, "no frame with joint states")
-    fine = RobotView(sights[0].path.robot, camera)
+    fine = RobotView(observations[0].path.robot, camera)
     coarse = fine.coarser(settings.stride)
-    differences = [difference_from(scene, s.frame) for s in sights]
+    differences = [difference_from(scene, s.frame) for s in observations]
     state = start
     history: list[tuple[_Residuals, _Residuals]] = []
     for k in range(settings.steps):
         share = k / max(settings.steps - 1, 1)
         gate = settings.widest_m * (settings.narrowest_m / settings.widest_m) ** share
-        depth = _joined([_depth_rows(s, coarse, state, gate, settings) for s in sights])
+        depth = _joined([_depth_rows(s, coarse, state, gate, settings) for s in observations])
         reach = settings.reach_px * 3.0**-share
         edges = [_Edges(d, scene.known, reach) for d in differences]
-        outline = _joined([_outline_rows(s, e, fine, camera, state, settings) for s, e in zip(sights, edges)])
+        outline = _joined([_outline_rows(s, e, fine, camera, state, settings) for s, e in zip(observations, edges)])
         if len(depth.r) < settings.least_samples:
             return _refused(start, f"only {len(depth.r)} depth samples on the robot")
         history.append((depth, outline))
@@ -214,20 +214,20 @@ def _center(camera_from_base: Transform) -> Float[Array, "3"]:
     return camera_from_base.points(np.array([[0.25, 0.0, 0.4]]))[0]
 
 
-def _links(sight: Sight, state: _State, time_ns: int) -> dict[str, Transform]:
+def _links(observation: RobotObservation, state: _State, time_ns: int) -> dict[str, Transform]:
     """camera_from_link at an image's time."""
     base = state.camera_from_base
-    joined = sight.path.links(time_ns + int(state.delay_s * 1e9))
-    root = Transform.identity(base.source, sight.path.robot.root)
+    joined = observation.path.links(time_ns + int(state.delay_s * 1e9))
+    root = Transform.identity(base.source, observation.path.robot.root)
     return {name: base @ root @ link for name, link in joined.items()}
 
 
 def _velocities(
-    sight: Sight, state: _State, time_ns: int, view: RobotView, at: Array, points: Array
+    observation: RobotObservation, state: _State, time_ns: int, view: RobotView, at: Array, points: Array
 ) -> Float[Array, "n 3"]:
     """Velocity in the camera frame of drawn points, by the motion of their links."""
-    early, late = _links(sight, state, time_ns - STEP_NS), _links(sight, state, time_ns + STEP_NS)
-    now = _links(sight, state, time_ns)
+    early, late = _links(observation, state, time_ns - STEP_NS), _links(observation, state, time_ns + STEP_NS)
+    now = _links(observation, state, time_ns)
     out = np.zeros_like(points)
     for number, link in enumerate(view.parts):
         mine = at == number
@@ -237,11 +237,13 @@ def _velocities(
     return out
 
 
-def _depth_rows(sight: Sight, view: RobotView, state: _State, gate_m: float, s: RobotFitSettings) -> _Residuals:
-    time_ns = sight.frame.depth_time_ns
-    leave_out = () if np.isfinite(sight.path.finger_width_m(time_ns)) else FINGERS
-    image = view.draw(_links(sight, state, time_ns), leave_out)
-    measured = sight.frame.depth_m[:: s.stride, :: s.stride]
+def _depth_rows(
+    observation: RobotObservation, view: RobotView, state: _State, gate_m: float, s: RobotFitSettings
+) -> _Residuals:
+    time_ns = observation.frame.depth_time_ns
+    leave_out = () if np.isfinite(observation.path.finger_width_m(time_ns)) else FINGERS
+    image = view.draw(_links(observation, state, time_ns), leave_out)
+    measured = observation.frame.depth_m[:: s.stride, :: s.stride]
     inner = max(1, round(s.margin_px / s.stride))
     solid = cv2.erode((image.depth_m > 0).astype(np.uint8), np.ones((2 * inner + 1,) * 2, np.uint8)) > 0
     use = solid & (measured > 0) & (np.abs(measured / state.scale - image.depth_m) < gate_m)
@@ -251,7 +253,7 @@ def _depth_rows(sight: Sight, view: RobotView, state: _State, gate_m: float, s: 
     along = (normal * rays).sum(-1)  # how a change of depth moves the point along the normal
     raw = along * (measured_m / state.scale - drawn_m)
     sigma = np.maximum(stereo_sigma_m(image.depth_m[use]), 0.001) * np.maximum(np.abs(along), 0.2)
-    velocity = _velocities(sight, state, time_ns, view, image.part[use], points)
+    velocity = _velocities(observation, state, time_ns, view, image.part[use], points)
     J = _by_motion(normal, points - _center(state.camera_from_base), velocity)
     J[:, SCALE] = -along * measured_m / state.scale
     return _Residuals(raw / sigma, J / sigma[:, None], raw)
@@ -267,15 +269,15 @@ def _by_motion(normal: Array, arm: Array, velocity: Array) -> Float[Array, "n 8"
 
 
 def _outline_rows(
-    sight: Sight,
+    observation: RobotObservation,
     edges: _Edges,
     view: RobotView,
     camera: CameraModel,
     state: _State,
     s: RobotFitSettings,
 ) -> _Residuals:
-    time_ns = sight.frame.time_ns
-    image = view.draw(_links(sight, state, time_ns), FINGERS)
+    time_ns = observation.frame.time_ns
+    image = view.draw(_links(observation, state, time_ns), FINGERS)
     outline = _outline(image.depth_m > 0, s.outlines)
     if outline is None:
         return _nothing()
@@ -288,7 +290,7 @@ def _outline_rows(
     h = 1e-4
     turned = [camera.project(points + h * e) - camera.project(points - h * e) for e in np.eye(3)]
     by_point = np.stack([(t * outward).sum(-1) / (2 * h) for t in turned], -1)  # outline's motion along its normal
-    velocity = _velocities(sight, state, time_ns, view, image.part[v, u], points)
+    velocity = _velocities(observation, state, time_ns, view, image.part[v, u], points)
     J = _by_motion(by_point, points - _center(state.camera_from_base), velocity)
     return _Residuals(offset / s.edge_sigma_px, J / s.edge_sigma_px, offset)
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from processing.contact.friction.estimate import frames_are_slow, friction_by_forecasts
-from processing.contact.friction.forecast import MEMBERS, Course, Forecasts, Law, RigidBody
+from processing.contact.friction.forecast import MEMBERS, Forecasts, Law, ObservedTrajectory, RigidBody
 from processing.contact.learn.prepared import prepare
 from processing.contact.learn.prior import prior_from_size
 from processing.contact.physics.plane import Plane
@@ -43,9 +43,9 @@ def test_friction_by_forecasts_at_30_hz_under_noise_is_the_true_one(simulated_to
 
 def test_of_frictions_at_30_hz_under_noise_the_true_one_forecasts_best(simulated_tosses, rigid_box):
     tosses = [noisy(t.part(slice(0, 90, 5)), 1) for t in simulated_tosses(6, 130)]
-    courses = [Course(t.time_s, t.rotation, t.position_m, 3) for t in tosses]
+    trajectories = [ObservedTrajectory(t.time_s, t.rotation, t.position_m, 3) for t in tosses]
     laws = [Law(f * BOX_FRICTION, 0.0, 0.05) for f in (0.6, 0.8, 1.0, 1.25, 1.7)]
-    found = Forecasts(courses, rigid_box, Noise(1e-3, np.radians(0.5))).scores(laws)
+    found = Forecasts(trajectories, rigid_box, Noise(1e-3, np.radians(0.5))).scores(laws)
     assert found.shape == (5, 6)
     assert found.sum(1).argmin() == 2
 
@@ -93,8 +93,8 @@ def test_in_flight_no_friction_forecasts_better_than_another(rigid_box):
     rng, time_s = np.random.default_rng(0), np.arange(9) / 30
     fall = np.stack([1.0 * time_s, 0 * time_s, 3 + 0.2 * time_s - 0.5 * GRAVITY_M_S2 * time_s**2], 1)
     turns = rotation_matrices(np.outer(time_s, [0.0, 0.0, 4.0]))
-    courses = [
-        Course(
+    trajectories = [
+        ObservedTrajectory(
             time_s,
             turns @ rotation_matrices(0.01 * rng.standard_normal((9, 3))),
             fall + 1e-3 * rng.standard_normal((9, 3)),
@@ -102,7 +102,9 @@ def test_in_flight_no_friction_forecasts_better_than_another(rigid_box):
         )
         for _ in range(12)
     ]
-    found = Forecasts(courses, rigid_box, Noise(1e-3, 0.01)).scores([Law(0.1, 0.0, 0.1), Law(0.5, 0.3, 0.4)]).sum(1)
+    found = (
+        Forecasts(trajectories, rigid_box, Noise(1e-3, 0.01)).scores([Law(0.1, 0.0, 0.1), Law(0.5, 0.3, 0.4)]).sum(1)
+    )
     assert found[0] == pytest.approx(found[1])
     # three frames a toss; of a Gaussian as wide as the truth the score is half the mean distance
     assert found[0] / (12 * 3) == pytest.approx(0.5, abs=0.15)

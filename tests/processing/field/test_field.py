@@ -112,8 +112,8 @@ def test_what_no_view_saw_stays_as_a_shape_is_believed_to_be_and_what_views_saw_
     longer_m = 0.012  # than the cube, on both sides of z: one of them is in view
     box = trimesh.creation.box([2 * HALF_M, 2 * HALF_M, 2 * (HALF_M + longer_m)]).subdivide().subdivide()
     green = np.tile(np.array([0, 255, 0], dtype=np.uint8), (len(box.vertices), 1))
-    believed = ObjectShape("object", "test", np.asarray(box.vertices), np.asarray(box.faces), green)
-    grid = fuse(views, FuseConfig(truncation_m=0.005), believed)
+    prior_shape = ObjectShape("object", "test", np.asarray(box.vertices), np.asarray(box.faces), green)
+    grid = fuse(views, FuseConfig(truncation_m=0.005), prior_shape)
     shape = grid_mesh(grid)
     assert shape.vertices_m[:, 2].max() == pytest.approx(HALF_M + longer_m, abs=0.001)
     assert shape.vertices_m[:, 2].min() > -HALF_M - 0.2 * longer_m

@@ -15,7 +15,13 @@ import pytest
 
 from processing.segment.background.depth_scale import DepthScaleSettings, accepted_scale, table_scale
 from processing.segment.background.static_scene import StaticScene, calibrated_table_depth
-from processing.segment.robot.fit import RobotFitSettings, Sight, choose_sights, edge_offsets, fit_robot
+from processing.segment.robot.fit import (
+    RobotFitSettings,
+    RobotObservation,
+    choose_observations,
+    edge_offsets,
+    fit_robot,
+)
 from processing.segment.robot.frames import RobotFrames, RobotSettings, with_robot
 from processing.segment.robot.of_session import Rig, RobotOfSession
 from processing.segment.robot.render import RobotView
@@ -112,9 +118,9 @@ def test_place_clock_and_scale_are_found_from_the_pictures(view: RobotView, wall
     axis = np.array([0.6, -0.5, 0.62])
     off = Transform("base", "base", rotation_exp(np.deg2rad(0.5) * axis), np.array([-0.003, 0.003, 0.0025]))
     path = ArmPath(panda(), states(offset_s=0.010))
-    sights = [Sight(drawn_frame(view, wall, i, 1.01), path) for i in (3, 8, 13, 18, 23, 28)]
+    observations = [RobotObservation(drawn_frame(view, wall, i, 1.01), path) for i in (3, 8, 13, 18, 23, 28)]
     seen = replace(wall, depth_m=wall.depth_m * np.float32(1.01))
-    fit = fit_robot(sights, CAMERA, CAMERA_FROM_BASE @ off, seen, RobotFitSettings(stride=3, margin_px=2))
+    fit = fit_robot(observations, CAMERA, CAMERA_FROM_BASE @ off, seen, RobotFitSettings(stride=3, margin_px=2))
     assert fit.refused is None
     left = fit.camera_from_base.inverse() @ CAMERA_FROM_BASE
     at = np.array([[0.3, 0.0, 0.5]])
@@ -128,7 +134,7 @@ def test_place_clock_and_scale_are_found_from_the_pictures(view: RobotView, wall
 def test_a_robot_that_is_not_in_view_is_not_refined(wall: StaticScene) -> None:
     away = Transform("d455", "base", TURN, np.array([0.0, 0.45, -3.0]))
     frame = RgbdFrame("d455", 0, FRAME_NS, FRAME_NS, wall.color_rgb.astype(np.uint8), wall.depth_m)
-    fit = fit_robot([Sight(frame, ArmPath(panda(), states()))], CAMERA, away, wall, RobotFitSettings())
+    fit = fit_robot([RobotObservation(frame, ArmPath(panda(), states()))], CAMERA, away, wall, RobotFitSettings())
     assert fit.refused is not None
     assert fit.camera_from_base is away
     assert fit.depth_scale == 1.0
@@ -145,7 +151,9 @@ def test_an_edge_is_found_where_it_lies() -> None:
 
 
 def test_sights_are_spread_and_fast_and_known() -> None:
-    chosen = choose_sights([20, 20], lambda t, i: float("nan") if t == 1 else float(i), RobotFitSettings(frames=6))
+    chosen = choose_observations(
+        [20, 20], lambda t, i: float("nan") if t == 1 else float(i), RobotFitSettings(frames=6)
+    )
     assert {t for t, _ in chosen} == {0}
     assert {(0, 0), (0, 19), (0, 18), (0, 17)} <= set(chosen)
 
