@@ -57,11 +57,11 @@ class Preview:
             stride = max(1, image.pixels.shape[1] // WIDEST_PX)
             small: Any = image.pixels[::stride, ::stride]
             if topic.endswith("depth"):
-                unit_m = recorder.looks[-1].unit_m if recorder.looks else 0.001
+                unit_m = recorder.thumbnails[-1].unit_m if recorder.thumbnails else 0.001
                 self.view.depth(topic, time_ns, small, unit_m)
             else:
                 self.view.image(topic, time_ns, small)
-            tally = recorder.lanes[topic].counter.tally()
+            tally = recorder.queues[topic].counter.tally()
             self.view.value(f"{topic}/lost", time_ns, float(tally.dropped_total + tally.missed))
         if recorder.widths:
             sample = recorder.widths[-1]

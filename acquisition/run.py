@@ -21,14 +21,15 @@ from acquisition.detect import Eye, TossEvents, TossWatcher
 from acquisition.devices import Arm, DeviceLost, DeviceRefused, Gripper
 from acquisition.interrupts import Interrupts
 from acquisition.operator import Operator
-from acquisition.streaming.recorder import Recorder, look_stride
+from acquisition.streaming.recorder import Recorder, thumbnail_stride
 from acquisition.streaming.sequence_check import Trouble
 from acquisition.streaming.streams import Tally
 from acquisition.verdict import Verdict, judge
 from recordings.errors import TosslabError, WriteFailed
+from recordings.mcap.toss_writer import TossWriter
 from recordings.progress import Progress
 from recordings.records import HealthLine, TossCommand, TossEvent
-from recordings.session_writer import SessionWriter, TossWriter, toss_name
+from recordings.session_writer import SessionWriter, toss_name
 from recordings.tracks import RigCalibration
 
 POLL_S = 0.02
@@ -225,7 +226,7 @@ class SessionRun:
         return False
 
     def _close(self) -> None:
-        """Wait for the lanes; stays answerable to Ctrl-C, and says so when the disk keeps everybody waiting."""
+        """Wait for the queues; stays answerable to Ctrl-C, and says so when the disk keeps everybody waiting."""
         self.recorder.end()
         self._ended_host_ns = time.monotonic_ns()
         tell = time.monotonic() + SLOW_S
@@ -266,14 +267,14 @@ class SessionRun:
             "clocks": self.recorder.clocks(),
             "gripper": take.gripper_story(),
             "motion": take.motion_story(),
-            "fullest_queues": {topic: lane.fullest for topic, lane in self.recorder.lanes.items()},
+            "fullest_queues": {topic: queue.fullest for topic, queue in self.recorder.queues.items()},
         }
 
     def watch_silence(self) -> list[Trouble]:
         """Streams that have said nothing for too long, each told once until it speaks again."""
         found = []
         for topic, seconds in self.recorder.silent_since_s().items():
-            limit_s = max(self.config.longest_gap_s, 5 / self.recorder.lanes[topic].rate_hz)
+            limit_s = max(self.config.longest_gap_s, 5 / self.recorder.queues[topic].rate_hz)
             if seconds > limit_s and topic not in self._silent:
                 self._silent.add(topic)
                 text = f"nothing came for {seconds:.1f} s"
@@ -299,7 +300,7 @@ class _Running:
         self._throw: Throw | None = None
         before_ns = time.monotonic_ns() - round(run.config.pre_trigger_s * 1e9)
         self._seen_look_ns = self._seen_width_ns = before_ns
-        still = [look for look in list(run.recorder.looks) if look.host_ns > before_ns]
+        still = [look for look in list(run.recorder.thumbnails) if look.host_ns > before_ns]
         if run.eye is not None and still:
             run.eye.learn([look.raw for look in still], still[-1].unit_m)
 
@@ -405,7 +406,7 @@ class _Running:
             self.watcher.width(recorder.clock.session_ns(sample.host_ns) / 1e9, sample.width_m)
         if run.eye is None:
             return
-        for look in [k for k in list(recorder.looks) if k.host_ns > self._seen_look_ns]:
+        for look in [k for k in list(recorder.thumbnails) if k.host_ns > self._seen_look_ns]:
             self._seen_look_ns = look.host_ns
             q = recorder.joints_at(look.host_ns)
             near = self.watcher.expected_m(look.time_ns / 1e9, run.eye.tool_m(q))
@@ -459,7 +460,7 @@ def make_eye(recorder: Recorder, calibration: RigCalibration) -> Eye | None:
     return Eye(
         calibration.camera(name),
         calibration.transform("world", name),
-        look_stride(calibration.camera(name).width),
+        thumbnail_stride(calibration.camera(name).width),
         arm_model(robot) if robot is not None else None,
         calibration.find("world", "base"),
     )
@@ -473,7 +474,7 @@ def expected_bytes_s(recorder: Recorder) -> float:
     """Bytes per second on the disk, from the pictures that flow."""
     total = 0.0
     lossless = recorder.rig.recording.mono_encoding == "lossless"
-    for topic, lane in recorder.lanes.items():
+    for topic, queue in recorder.queues.items():
         image = recorder.latest.get(topic)
         if image is None:
             total += ARM_BYTES_S if "arm" in topic else 0
@@ -481,7 +482,7 @@ def expected_bytes_s(recorder: Recorder) -> float:
         share = DEPTH_SHARE if topic.endswith("depth") else JPEG_SHARE
         if lossless and topic.endswith("/image"):
             share = LOSSLESS_SHARE
-        total += image.pixels.nbytes * share * lane.rate_hz
+        total += image.pixels.nbytes * share * queue.rate_hz
     return total
 
 

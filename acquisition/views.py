@@ -21,8 +21,9 @@ from acquisition.run import SessionReport
 from acquisition.streaming.recorder import Recorder
 from acquisition.synthetic.board import board_tags
 from calibration.cameras.targets import Target, TargetView, find_target, target_from_document
+from recordings.mcap.toss_writer import TossWriter
 from recordings.records import ArmStates, DepthImage, EncodedImage
-from recordings.session_writer import SessionWriter, TossWriter
+from recordings.session_writer import SessionWriter
 
 Kind = Literal["board", "hand-eye"]
 VIEW_APART_NS = 1_000_000_000
@@ -232,7 +233,7 @@ def _write(
         if image.pixels.ndim == 3:
             data = cv2.imencode(".png", cv2.cvtColor(image.pixels, cv2.COLOR_RGB2BGR))[1].tobytes()
             writer.color(EncodedImage(name, number, time_ns, time_ns, "png", width, height, data))
-            looks = list(recorder.looks)[-1:]
+            looks = list(recorder.thumbnails)[-1:]
             depth = recorder.latest.get(f"/{name}/depth")
             if depth is not None and looks:
                 writer.depth(DepthImage(name, number, time_ns, time_ns, looks[0].unit_m, depth.pixels))

@@ -12,8 +12,8 @@ from calibration.report import Report
 from recordings.geometry import CameraModel, Transform
 from recordings.manifest import renew
 from recordings.session import Session
-from recordings.session_writer import write_json
 from recordings.tracks import RigCalibration
+from recordings.whole_file import write_json
 
 WORK_FOLDER = "calibration"
 """Of a session: pictures of its calibrations, and the tags found in its images."""

@@ -71,7 +71,7 @@ def _work_tagslam(args: argparse.Namespace) -> Outcome:
     from groundtruth.tagslam.config import read_config
     from groundtruth.tagslam.detections import read_recording
     from groundtruth.tagslam.solve import run_tag_slam
-    from recordings.session_writer import write_bytes
+    from recordings.whole_file import write_bytes
 
     if not args.folder.is_dir():
         raise BadInput(

@@ -38,8 +38,9 @@ from recordings.geometry import Transform
 from recordings.progress import Progress, Silent
 from recordings.records import StampedPose
 from recordings.session import Session
-from recordings.session_writer import write_json, write_truth
+from recordings.session_writer import write_truth
 from recordings.sync import clock_offset_ns
+from recordings.whole_file import write_json
 
 TRUTH = "truth"
 LATE_S = 0.0007

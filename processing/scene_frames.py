@@ -24,7 +24,7 @@ from recordings.errors import TosslabError
 from recordings.records import RgbdFrame
 from recordings.robot.arm import panda
 from recordings.session import RgbdFrames
-from recordings.session_writer import file_sha256
+from recordings.whole_file import file_sha256
 
 LEAST_EACH = 4
 """Of a session with more tosses than give so many frames each, only some are looked at beside those of the run."""

@@ -18,7 +18,7 @@ from processing.store import Store
 from recordings.errors import BadInput
 from recordings.notices import Notice
 from recordings.session import Session
-from recordings.session_writer import file_sha256
+from recordings.whole_file import file_sha256
 
 
 def start_run(

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from recordings.bounded.documents import as_dict, read_document
 from recordings.errors import BadInput
-from recordings.session_writer import file_sha256, write_json
+from recordings.whole_file import file_sha256, write_json
 
 
 def renew(folder: Path, *names: str) -> None:

@@ -20,6 +20,7 @@ sys.path.insert(0, str(ROOT))
 
 from recordings.geometry import CameraModel, Transform, rotation_exp  # noqa: E402
 from recordings.mcap.codec import decode_image  # noqa: E402
+from recordings.mcap.toss_writer import TossWriter  # noqa: E402
 from recordings.records import (  # noqa: E402
     ArmStates,
     DepthImage,
@@ -30,7 +31,7 @@ from recordings.records import (  # noqa: E402
     TossEvent,
 )
 from recordings.session import Session  # noqa: E402
-from recordings.session_writer import SessionWriter, TossWriter, write_truth  # noqa: E402
+from recordings.session_writer import SessionWriter, write_truth  # noqa: E402
 from recordings.tracks import RigCalibration, TagPlacement  # noqa: E402
 
 WIDTH, HEIGHT, FRAMES, STEP_NS = 32, 24, 2, 33_333_333

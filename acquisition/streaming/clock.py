@@ -77,8 +77,8 @@ class ClockMapper:
         self._fitted_at_ns = 0
         self._count = 0
         self.steps: list[ClockStep] = []
-        self.told = 0
-        """How many of the steps somebody has been told of."""
+        self.reported = 0
+        """How many of the steps have been reported."""
         self.wraps = 0
 
     def add(self, device_ns: int, host_ns: int, number: int) -> int:

@@ -28,7 +28,7 @@ class Trouble:
 
 
 @dataclass
-class Gate:
+class SequenceCheck:
     """Judges the frames of one stream in order of receipt; counts what it does not let through."""
 
     topic: str
@@ -98,7 +98,7 @@ class Gate:
     def _tell(self, image: Image, kind: str, text: str, level: Level = "warning") -> None:
         self.troubles.append(Trouble(image.host_ns, self.topic, kind, text, level))
 
-    def told(self) -> list[Trouble]:
+    def new_troubles(self) -> list[Trouble]:
         """New troubles, once."""
         found, self.troubles = self.troubles, []
         return found

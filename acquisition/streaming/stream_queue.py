@@ -12,7 +12,7 @@ from typing import Any
 from acquisition.streaming.clock import ClockLine
 from acquisition.streaming.streams import WRITES, BoundedQueue, Counter, go_first
 from recordings.errors import BadInput, TosslabError, WriteFailed
-from recordings.session_writer import TossWriter
+from recordings.mcap.toss_writer import TossWriter
 
 WAIT_S = 0.1
 
@@ -50,8 +50,8 @@ Write = Callable[[Take, Item], int]
 """Writes an item; returns how many of its parts were written (the rest it has counted as dropped)."""
 
 
-class Lane:
-    """`offer` is called by the device's thread and never waits; everything slow happens in the lane's own thread."""
+class StreamQueue:
+    """`offer` is called by the device's thread and never waits; everything slow happens in the queue's own thread."""
 
     def __init__(
         self, topic: str, rate_hz: float, queue_s: float, ring_s: float, write: Write, hold_s: float = 0.0
@@ -65,7 +65,7 @@ class Lane:
         self._left_ns = 0
         self._ring_ns, self._hold_ns = round(ring_s * 1e9), round(hold_s * 1e9)
         self._write = write
-        self._thread = threading.Thread(target=self._run, name=f"lane {topic}", daemon=True)
+        self._thread = threading.Thread(target=self._run, name=f"queue {topic}", daemon=True)
 
     def start(self) -> None:
         self._thread.start()

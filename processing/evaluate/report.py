@@ -25,8 +25,8 @@ from recordings.film.raster import covered_pixels, outlined
 from recordings.mcap.codec import decode_image
 from recordings.results.folder import Results
 from recordings.session import Session
-from recordings.session_writer import write_bytes
 from recordings.tracks import ObjectShape
+from recordings.whole_file import write_bytes
 
 if TYPE_CHECKING:
     import trimesh

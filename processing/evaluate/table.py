@@ -12,8 +12,8 @@ from processing.evaluate.score import TossScore, Value, VariantScore
 from processing.variants import ROWS, TABLE, WITH_MODEL
 from recordings.notices import Notice, in_order, said_of
 from recordings.results.folder import Results, VariantRecord
-from recordings.session_writer import write_bytes, write_json
 from recordings.tracks import ObjectTrack
+from recordings.whole_file import write_bytes, write_json
 
 TABLE_FORMAT = 1
 COLUMNS = (

@@ -10,8 +10,8 @@ from processing.run import Run
 from processing.store import Done
 from recordings.errors import BadInput
 from recordings.results.folder import read_shape, read_track, write_contact, write_shape
-from recordings.session_writer import write_json
 from recordings.tracks import ObjectShape
+from recordings.whole_file import write_json
 
 VERSION = 3
 NO_PLANE = (

@@ -35,8 +35,8 @@ from processing.store import Store
 from recordings.errors import BadInput
 from recordings.progress import Progress
 from recordings.results.folder import VariantRecord, write_contact, write_shape, write_variant
-from recordings.session_writer import write_json
 from recordings.tracks import ObjectShape
+from recordings.whole_file import write_json
 
 if TYPE_CHECKING:
     from recordings.session import Session

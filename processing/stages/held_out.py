@@ -20,8 +20,8 @@ from processing.store import Done
 from recordings.errors import BadInput
 from recordings.geometry import Transform
 from recordings.results.folder import read_contact, read_shape, read_track
-from recordings.session_writer import write_json
 from recordings.tracks import ContactModel, ObjectShape, ObjectTrack
+from recordings.whole_file import write_json
 
 if TYPE_CHECKING:
     from processing.contact.learn.shape_comparison import TossLoss

@@ -20,8 +20,8 @@ from processing.track.flags import camera_covariance
 from recordings.geometry import skew
 from recordings.records import RgbdFrame
 from recordings.results.folder import read_shape, read_track, write_shape, write_track
-from recordings.session_writer import write_json
 from recordings.tracks import ObjectShape, ObjectTrack
+from recordings.whole_file import write_json
 
 VERSION = 3
 BORDER_PX = 2

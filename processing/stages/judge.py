@@ -13,7 +13,7 @@ from processing.refine.image_residuals import Explained, explain, pooled
 from processing.run import Run
 from processing.store import Done
 from recordings.results.folder import read_shape, read_track
-from recordings.session_writer import write_json
+from recordings.whole_file import write_json
 
 VERSION = 4
 

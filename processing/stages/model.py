@@ -8,7 +8,7 @@ from pathlib import Path
 from processing.run import Run
 from processing.store import Done
 from recordings.results.folder import read_shape, write_shape
-from recordings.session_writer import file_sha256
+from recordings.whole_file import file_sha256
 
 VERSION = 2
 

@@ -10,7 +10,7 @@ from processing.run import CAMERA, Run
 from processing.store import Done
 from recordings.errors import BadInput
 from recordings.results.folder import read_shape, read_track, write_contact
-from recordings.session_writer import write_json
+from recordings.whole_file import write_json
 
 VERSION = 3
 

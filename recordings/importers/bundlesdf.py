@@ -19,9 +19,10 @@ from recordings.geometry import CameraModel, Transform
 from recordings.importers import common
 from recordings.importers.common import ImportReport, Timed, Warnings
 from recordings.importers.images import IMAGE_SUFFIXES, read_depth_png, read_encoded, read_header, read_mask
+from recordings.mcap.toss_writer import TossWriter
 from recordings.progress import Progress, Silent
 from recordings.records import DepthImage, StampedPose
-from recordings.session_writer import SessionWriter, TossWriter, write_truth
+from recordings.session_writer import SessionWriter, write_truth
 from recordings.tracks import RigCalibration
 
 DEPTH_UNIT_M = 0.001

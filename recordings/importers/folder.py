@@ -23,9 +23,10 @@ from recordings.importers.common import ImportReport, Timed, Warnings
 from recordings.importers.folder_layout import Layout, read_layout
 from recordings.importers.images import IMAGE_SUFFIXES, read_depth_png, read_encoded, read_mask
 from recordings.importers.truth_folder import import_truth, read_truth_folder
+from recordings.mcap.toss_writer import TossWriter
 from recordings.progress import Progress, Silent
 from recordings.records import ArmStates, DepthImage, TossEvent
-from recordings.session_writer import SessionWriter, TossWriter
+from recordings.session_writer import SessionWriter
 
 ARM_JOINTS = {"franka_panda": tuple(f"panda_joint{i}" for i in range(1, 8))}
 ARM_BATCH = 50

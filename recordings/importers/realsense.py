@@ -24,9 +24,9 @@ from recordings.importers import common
 from recordings.importers.common import ImportReport, Warnings
 from recordings.importers.lens import fit_brown_conrady
 from recordings.importers.realsense_file import recorded
+from recordings.mcap.toss_writer import TossWriter
 from recordings.progress import Progress, Silent
 from recordings.records import DepthImage, EncodedImage
-from recordings.session_writer import TossWriter
 from recordings.tracks import RigCalibration
 
 SUFFIXES = (".bag", ".db3")

@@ -24,9 +24,9 @@ from recordings.importers.common import ImportReport, Timed, Warnings
 from recordings.importers.ros_bag_file import Bag
 from recordings.importers.ros_messages import Pixels, color_image, depth_image, joint_states, stamp_ns
 from recordings.importers.ros_topics import Topics, choose, describe
+from recordings.mcap.toss_writer import TossWriter
 from recordings.progress import Progress, Silent
 from recordings.records import ArmStates, DepthImage, EncodedImage
-from recordings.session_writer import TossWriter
 from recordings.tracks import RigCalibration
 
 FLOAT_DEPTH_UNIT_M = 0.00025

@@ -9,14 +9,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from recordings.bounded.documents import as_dict, json_object, mapping, read_document
+from recordings.bounded.documents import FORMAT_VERSION, as_dict, json_object, mapping, read_document
 from recordings.errors import BadInput, TosslabError, WriteFailed
 from recordings.mcap.file import McapFile
 from recordings.mcap.recover import STOP, Recovered, recover_file
 from recordings.progress import Progress, Silent
-from recordings.session_writer import FORMAT_VERSION, file_sha256, write_bytes, write_json
 from recordings.tracks import RigCalibration
 from recordings.verify.structure import check_structure
+from recordings.whole_file import file_sha256, write_bytes, write_json
 
 LEFT_BEHIND = ("results",)
 

@@ -28,8 +28,8 @@ from recordings.errors import BadInput, DamagedFile
 from recordings.mcap.codec import decode_mask
 from recordings.notices import Notice
 from recordings.results.shape_file import read_shape, write_shape
-from recordings.session_writer import write_bytes, write_json
 from recordings.tracks import ContactModel, ObjectShape, ObjectTrack, RigCalibration, Status
+from recordings.whole_file import write_bytes, write_json
 
 RESULTS_FORMAT = 1
 Scope = Literal["one", "all"]

@@ -10,8 +10,8 @@ from numpy import ndarray as Array
 
 from recordings.bounded.documents import read_json
 from recordings.errors import BadInput, DamagedFile
-from recordings.session_writer import write_bytes, write_json
 from recordings.tracks import ObjectShape
+from recordings.whole_file import write_bytes, write_json
 
 VERTEX = np.dtype([("xyz", "<f8", 3), ("rgb", "u1", 3), ("observed", "u1")])
 FACE = np.dtype([("n", "u1"), ("abc", "<i4", 3)])

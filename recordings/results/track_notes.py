@@ -22,7 +22,7 @@ from numpy import ndarray as Array
 from recordings.bounded.limits import open_npz
 from recordings.errors import BadInput, DamagedFile
 from recordings.results.folder import Results
-from recordings.session_writer import write_bytes
+from recordings.whole_file import write_bytes
 
 FIT, NOTES = "toss_{:02d}.fit.npz", "toss_{:02d}.notes.npz"
 

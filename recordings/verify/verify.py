@@ -11,10 +11,10 @@ from recordings.bounded.documents import as_dict, json_object, parse_json, read_
 from recordings.errors import BadInput, DamagedFile, TosslabError
 from recordings.progress import Progress, Silent
 from recordings.session import Toss
-from recordings.session_writer import file_sha256
 from recordings.tracks import RigCalibration
 from recordings.verify.content import check_content
 from recordings.verify.structure import Finding, Severity, Structure, check_structure
+from recordings.whole_file import file_sha256
 
 ORDER: dict[Severity, int] = {"error": 0, "warning": 1, "info": 2}
 

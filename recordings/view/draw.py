@@ -16,7 +16,6 @@ from recordings.mcap.file import McapFile
 from recordings.progress import Progress, Silent
 from recordings.results.folder import Results
 from recordings.session import Session
-from recordings.session_writer import write_bytes
 from recordings.view.arm import known_arm, log_arm_model, log_arm_motion
 from recordings.view.blueprint import ABOUT, about_text, blueprint
 from recordings.view.bodies import log_bodies, log_rig
@@ -28,6 +27,7 @@ from recordings.view.scene import Scene, moment_ns, result_bodies, results_scene
 from recordings.view.track import log_tracking
 from recordings.view.truth import log_truth
 from recordings.view.viewer import NoGraphics, Viewer, ViewerFailed, run_rerun
+from recordings.whole_file import write_bytes
 
 APPLICATION = "tosslab"
 RRD_MAGIC = b"RRF2"

@@ -390,7 +390,7 @@ def test_a_failing_close_says_what_it_was() -> None:
     recorder = object.__new__(Recorder)
     recorder._troubles, recorder._not_put_away = deque(), {}
     for _ in range(3):
-        recorder._put_away("mono0", Broken().close)
+        recorder.put_away("mono0", Broken().close)
     told = recorder.troubles()
     assert [(t.device, t.kind, t.text) for t in told] == [
         ("mono0", "not put away", "close failed: ValueError: cable of smoke")

@@ -18,11 +18,12 @@ from acquisition.cli import main
 from acquisition.detect import Moment, TossEvents
 from acquisition.rig import RecordingConfig
 from acquisition.streaming.sequence_check import Trouble
-from acquisition.streaming.stream_queue import Item, Lane, Take
+from acquisition.streaming.stream_queue import Item, StreamQueue, Take
 from acquisition.streaming.streams import BoundedQueue, Counter, Tally
 from acquisition.verdict import judge
+from recordings.mcap.toss_writer import TossWriter
 from recordings.session import Session
-from recordings.session_writer import SessionWriter, TossWriter
+from recordings.session_writer import SessionWriter
 from recordings.verify.verify import verify
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -89,7 +90,7 @@ def test_a_tally_adds_up() -> None:
 
 @pytest.fixture
 def writer(tmp_path: Path) -> TossWriter:
-    return SessionWriter(tmp_path / "lanes", {}).toss(0)
+    return SessionWriter(tmp_path / "queues", {}).toss(0)
 
 
 class Sheet:
@@ -107,38 +108,38 @@ class Sheet:
 
 def test_a_take_holds_the_ring_before_it_and_nothing_after_its_end(writer: TossWriter) -> None:
     sheet = Sheet()
-    lane = Lane("/x", 100.0, 5.0, 0.5, sheet.write)
-    lane.start()
+    queue = StreamQueue("/x", 100.0, 5.0, 0.5, sheet.write)
+    queue.start()
     now = time.monotonic_ns()
     for k in range(10):
-        lane.offer(Item(k, now - (10 - k) * 100_000_000))  # one every 0.1 s, the last 0.1 s ago
+        queue.offer(Item(k, now - (10 - k) * 100_000_000))  # one every 0.1 s, the last 0.1 s ago
     time.sleep(0.2)
     take = Take(writer, now - 450_000_000)
-    lane.take = take
-    lane.offer(Item(10, now))
+    queue.take = take
+    queue.offer(Item(10, now))
     time.sleep(0.2)
     take.end_host_ns = now + 50_000_000
-    assert lane.mark().wait(2)
-    lane.offer(Item(11, now + 20_000_000))  # belongs to the take, but comes too late for it
-    lane.offer(Item(12, now + 100_000_000))
-    assert lane.stop(2.0)
+    assert queue.mark().wait(2)
+    queue.offer(Item(11, now + 20_000_000))  # belongs to the take, but comes too late for it
+    queue.offer(Item(12, now + 100_000_000))
+    assert queue.stop(2.0)
     assert sheet.written[-1] == 10
     assert set(sheet.written) <= set(range(5, 11))
-    tally = lane.counter.tally()
+    tally = queue.counter.tally()
     assert tally.dropped == {"too late": 1}
     assert tally.received == 13 == tally.written + tally.idle + 1
 
 
 def test_a_slow_writer_never_makes_the_driver_wait(writer: TossWriter, own_time: Any) -> None:
-    lane = Lane("/x", 100.0, 0.1, 0.5, Sheet(slow_s=0.05).write)
-    lane.start()
-    lane.take = Take(writer, 0)
+    queue = StreamQueue("/x", 100.0, 0.1, 0.5, Sheet(slow_s=0.05).write)
+    queue.start()
+    queue.take = Take(writer, 0)
     with own_time() as spent:
         for k in range(1000):
-            lane.offer(Item(k, time.monotonic_ns()))
+            queue.offer(Item(k, time.monotonic_ns()))
     assert spent.seconds < 0.5
-    lane.stop(5.0)
-    tally = lane.counter.tally()
+    queue.stop(5.0)
+    tally = queue.counter.tally()
     assert tally.dropped["queue full"] > 900
     assert tally.received == tally.written + tally.dropped_total + tally.idle
 

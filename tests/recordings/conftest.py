@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 
 from recordings.geometry import CameraModel, Transform
+from recordings.mcap.toss_writer import TossWriter
 from recordings.records import ArmStates, DepthImage, EncodedImage, HealthLine, StampedPose, TossCommand, TossEvent
-from recordings.session_writer import SessionWriter, TossWriter
+from recordings.session_writer import SessionWriter
 from recordings.tracks import RigCalibration
 
 PERIOD_NS = 33_333_333

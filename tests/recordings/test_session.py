@@ -16,9 +16,10 @@ from recordings.errors import BadInput, DamagedFile, TosslabError, WriteFailed
 from recordings.geometry import CameraModel, Transform
 from recordings.mcap.codec import decode_image
 from recordings.mcap.recover_session import recover
+from recordings.mcap.toss_writer import TossWriter
 from recordings.records import EncodedImage, TossWindow
 from recordings.session import Session
-from recordings.session_writer import SessionWriter, TossWriter
+from recordings.session_writer import SessionWriter
 from recordings.tracks import RigCalibration
 from recordings.verify.inspect import inspect
 from recordings.verify.verify import verify

@@ -202,7 +202,7 @@ def test_other_files_are_refused(tmp_path, name, text):
 
 
 def test_no_frame_is_lost_when_the_writer_is_slower_than_the_playback(record: Record, tmp_path, monkeypatch):
-    from recordings.session_writer import TossWriter
+    from recordings.mcap.toss_writer import TossWriter
 
     quick = TossWriter.color
 

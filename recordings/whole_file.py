@@ -1,0 +1,44 @@
+"""Files that are there whole or not at all, and their sha256."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from recordings.errors import WriteFailed
+
+
+def write_json(path: Path, document: Mapping[str, Any]) -> None:
+    """Whole or not at all: written beside, synced, renamed."""
+    write_bytes(path, json_bytes(document))
+
+
+def write_bytes(path: Path, data: bytes) -> None:
+    """Whole or not at all: written beside, synced, renamed. Raises WriteFailed."""
+    partial = path.with_name(path.name + ".partial")
+    try:
+        with open(partial, "wb") as out:
+            out.write(data)
+            out.flush()
+            os.fsync(out.fileno())
+        partial.replace(path)
+    except OSError as refused:
+        with contextlib.suppress(OSError):
+            partial.unlink()
+        raise WriteFailed(f"{path} could not be written: {refused.strerror}; nothing was changed there") from refused
+
+
+def file_sha256(path: Path) -> str:
+    """Of a file's bytes, in hexadecimal."""
+    with open(path, "rb") as data:
+        return hashlib.file_digest(data, "sha256").hexdigest()
+
+
+def json_bytes(document: Mapping[str, Any]) -> bytes:
+    """A JSON document as it stands in files."""
+    return (json.dumps(document, indent=1) + "\n").encode()
