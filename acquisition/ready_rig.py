@@ -11,7 +11,7 @@ from acquisition.rig import Rig
 from recordings.tracks import RigCalibration
 
 if TYPE_CHECKING:
-    from acquisition.drivers.synthetic import SyntheticLab
+    from acquisition.synthetic.lab_state import LabState
 
 
 @dataclass(eq=False)
@@ -22,7 +22,7 @@ class Setup:
     devices: dict[str, Device]
     thrower: Thrower
     calibration: RigCalibration
-    lab: SyntheticLab | None = None
+    lab: LabState | None = None
     live: bool = True
     """False: a recording, which has nothing to say before it is played."""
 

@@ -20,11 +20,12 @@ from acquisition.arm.toss import TossPlan
 from acquisition.detect import Eye, TossEvents, TossWatcher
 from acquisition.devices import Arm, DeviceLost, DeviceRefused, Gripper
 from acquisition.interrupts import Interrupts
+from acquisition.judge import judge
 from acquisition.operator import Operator
 from acquisition.streaming.recorder import Recorder, thumbnail_stride
 from acquisition.streaming.sequence_check import Trouble
 from acquisition.streaming.streams import Tally
-from acquisition.verdict import Verdict, judge
+from acquisition.verdict import Verdict
 from recordings.errors import TosslabError, WriteFailed
 from recordings.mcap.toss_writer import TossWriter
 from recordings.progress import Progress

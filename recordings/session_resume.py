@@ -8,9 +8,9 @@ from recordings.bounded.documents import as_dict, json_object, read_document
 from recordings.errors import BadInput
 from recordings.mcap.file import McapFile
 from recordings.mcap.recover import STOP, Recovered, recover_file
+from recordings.mcap.structure import check_structure
 from recordings.session_writer import FinishedFile, SessionWriter
 from recordings.tracks import RigCalibration
-from recordings.verify.structure import check_structure
 from recordings.whole_file import file_sha256
 
 CUT = ".cut"

@@ -15,8 +15,8 @@ from typing import Any
 from acquisition.arm.toss import TossPlan
 from acquisition.drivers.synthetic_arm import SyntheticArm, SyntheticGripper
 from acquisition.drivers.synthetic_cameras import SyntheticMono, SyntheticRgbd
-from acquisition.drivers.synthetic_device import LabState
 from acquisition.synthetic.lab_config import SyntheticConfig
+from acquisition.synthetic.lab_state import LabState
 from recordings.errors import BadInput
 from recordings.progress import Progress
 
@@ -27,19 +27,6 @@ class SyntheticLab(LabState):
     def __init__(self, config: SyntheticConfig) -> None:
         super().__init__(config)
         self._opened: set[str] = set()
-
-    def show_views(self) -> None:
-        """Play the views of the board that were set up, the arm going from one to the next."""
-        ready = self.stage.ready
-        trajectory = getattr(ready.motion.swing, "trajectory", None) if ready is not None else None
-        if trajectory is None:
-            raise RuntimeError("no views were set up")
-        self.arm.move(trajectory)
-
-    def show_views_again(self) -> None:
-        """The same views from the beginning: a busy machine may have missed some."""
-        self.stage.set_up(self.stage.shown[-1].performance)
-        self.show_views()
 
     def device(
         self, name: str, kind: str, rate_hz: float = 30.0

@@ -18,7 +18,8 @@ from acquisition.devices import (
     JointTrajectory,
     Motion,
 )
-from acquisition.drivers.synthetic_device import DeviceClock, LabState, SimulatedDevice
+from acquisition.drivers.synthetic_device import DeviceClock, SimulatedDevice
+from acquisition.synthetic.lab_state import LabState
 from acquisition.synthetic.random_draws import generator
 
 ARM_NOISE = (2e-5, 1.5e-3)

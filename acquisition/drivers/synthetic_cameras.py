@@ -16,7 +16,8 @@ from acquisition.devices import (
     Image,
     RgbdCapture,
 )
-from acquisition.drivers.synthetic_device import DeviceClock, LabState, SimulatedDevice
+from acquisition.drivers.synthetic_device import DeviceClock, SimulatedDevice
+from acquisition.synthetic.lab_state import LabState
 from acquisition.synthetic.random_draws import generator
 from recordings.geometry import CameraModel, Transform
 

@@ -14,12 +14,12 @@ from recordings.session import Session, Toss
 from recordings.sync import clock_offset_ns
 
 if TYPE_CHECKING:
-    from acquisition.drivers.synthetic import SyntheticLab
+    from acquisition.synthetic.lab_state import LabState
 
 SUFFIX = "_truth"
 
 
-def write_beside(lab: SyntheticLab, session: Path) -> Path | None:
+def write_beside(lab: LabState, session: Path) -> Path | None:
     """True poses at the frames of every toss that this lab played, exposure times, shape and physics."""
     if not lab.show.rendered:
         return None
@@ -37,7 +37,7 @@ def write_beside(lab: SyntheticLab, session: Path) -> Path | None:
     return truth
 
 
-def _write_toss(lab: SyntheticLab, toss: Toss, folder: Path) -> None:
+def _write_toss(lab: LabState, toss: Toss, folder: Path) -> None:
     stage = lab.stage
     color = toss.color("d455")
     frames = _frames(toss, "/d455/color")

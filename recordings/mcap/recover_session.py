@@ -13,9 +13,9 @@ from recordings.bounded.documents import FORMAT_VERSION, as_dict, json_object, m
 from recordings.errors import BadInput, TosslabError, WriteFailed
 from recordings.mcap.file import McapFile
 from recordings.mcap.recover import STOP, Recovered, recover_file
+from recordings.mcap.structure import check_structure
 from recordings.progress import Progress, Silent
 from recordings.tracks import RigCalibration
-from recordings.verify.structure import check_structure
 from recordings.whole_file import file_sha256, write_bytes, write_json
 
 LEFT_BEHIND = ("results",)

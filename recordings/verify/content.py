@@ -15,9 +15,9 @@ from recordings.errors import TosslabError
 from recordings.geometry import CameraModel
 from recordings.given_masks import GivenMasks
 from recordings.mcap import codec
+from recordings.mcap.structure import Finding, Severity, TopicSeen
 from recordings.records import DepthImage, EncodedImage
 from recordings.session import PAIR_WITHIN_PERIODS, Toss
-from recordings.verify.structure import Finding, Severity, TopicSeen
 
 UNITS_M = (0.001, 0.00025, 0.0001)
 """Units that depth cameras are set to."""

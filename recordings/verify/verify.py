@@ -9,11 +9,11 @@ from typing import Any
 
 from recordings.bounded.documents import as_dict, json_object, parse_json, read_document
 from recordings.errors import BadInput, DamagedFile, TosslabError
+from recordings.mcap.structure import Finding, Severity, Structure, check_structure
 from recordings.progress import Progress, Silent
 from recordings.session import Toss
 from recordings.tracks import RigCalibration
 from recordings.verify.content import check_content
-from recordings.verify.structure import Finding, Severity, Structure, check_structure
 from recordings.whole_file import file_sha256
 
 ORDER: dict[Severity, int] = {"error": 0, "warning": 1, "info": 2}

@@ -16,11 +16,11 @@ import pytest
 
 from acquisition.cli import main
 from acquisition.detect import Moment, TossEvents
+from acquisition.judge import judge
 from acquisition.rig import RecordingConfig
 from acquisition.streaming.sequence_check import Trouble
 from acquisition.streaming.stream_queue import Item, StreamQueue, Take
 from acquisition.streaming.streams import BoundedQueue, Counter, Tally
-from acquisition.verdict import judge
 from recordings.mcap.toss_writer import TossWriter
 from recordings.session import Session
 from recordings.session_writer import SessionWriter

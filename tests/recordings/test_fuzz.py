@@ -12,8 +12,8 @@ from recordings.errors import TosslabError
 from recordings.mcap.codec import decode_image
 from recordings.mcap.file import McapFile
 from recordings.mcap.recover import recover_file
+from recordings.mcap.structure import check_structure
 from recordings.session import Session
-from recordings.verify.structure import check_structure
 from recordings.verify.verify import verify
 
 LONGEST_S = 1.0

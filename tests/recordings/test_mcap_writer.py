@@ -18,8 +18,8 @@ from mcap.stream_reader import StreamReader
 from recordings.errors import BadInput, WriteFailed
 from recordings.mcap.file import McapFile
 from recordings.mcap.recover import recover_file
+from recordings.mcap.structure import check_structure
 from recordings.mcap.writer import CHUNK_BYTES, CHUNK_NS, McapWriter
-from recordings.verify.structure import check_structure
 
 
 def filled(path: Path, count: int = 10, size: int = 100, step_ns: int = 1_000_000) -> str:

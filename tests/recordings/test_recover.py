@@ -16,9 +16,9 @@ from recordings.errors import BadInput, WriteFailed
 from recordings.mcap.file import McapFile
 from recordings.mcap.recover import missing_numbers, recover_file
 from recordings.mcap.recover_session import recover
+from recordings.mcap.structure import check_structure
 from recordings.mcap.writer import McapWriter
 from recordings.session import Session
-from recordings.verify.structure import check_structure
 from recordings.verify.verify import verify
 
 
