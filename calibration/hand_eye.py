@@ -24,7 +24,7 @@ from calibration.cameras.poses import angle_deg, exp_poses, inverse_poses, log_p
 from calibration.cameras.targets import TargetView
 from calibration.report import Finding, Report, limit
 from recordings.errors import BadInput
-from recordings.geometry import CameraModel
+from recordings.geometry import CameraModel, skew
 from recordings.robust import huber_cost, huber_weight
 
 Mounting = Literal["eye-to-hand", "eye-in-hand"]
@@ -182,8 +182,8 @@ def daniilidis(A: Float[Array, "n 4 4"], B: Float[Array, "n 4 4"]) -> tuple[Arra
     qb, db = _dual(b)
     rows = []
     for p, dp, q, dq in zip(qa, da, qb, db):
-        top = np.hstack([(p - q)[1:, None], _skew(p[1:] + q[1:]), np.zeros((3, 4))])
-        low = np.hstack([(dp - dq)[1:, None], _skew(dp[1:] + dq[1:]), (p - q)[1:, None], _skew(p[1:] + q[1:])])
+        top = np.hstack([(p - q)[1:, None], skew(p[1:] + q[1:]), np.zeros((3, 4))])
+        low = np.hstack([(dp - dq)[1:, None], skew(dp[1:] + dq[1:]), (p - q)[1:, None], skew(p[1:] + q[1:])])
         rows += [top, low]
     _, _, vt = np.linalg.svd(np.vstack(rows))
     u1, v1, u2, v2 = vt[6, :4], vt[6, 4:], vt[7, :4], vt[7, 4:]
@@ -227,10 +227,6 @@ def _completed(A: Array, B: Array, a: Array, b: Array, R: Array) -> tuple[Array,
 def _nearest(matrix: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
     u, _, vt = np.linalg.svd(matrix)
     return u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
-
-
-def _skew(v: Float[Array, "3"]) -> Float[Array, "3 3"]:
-    return np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
 
 
 @dataclass(frozen=True, eq=False)

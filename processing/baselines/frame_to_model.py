@@ -16,9 +16,10 @@ from jaxtyping import Bool, Float, Float32, Int, UInt8
 from numpy import ndarray as Array
 from scipy.spatial import cKDTree
 
+from processing.motion.tangents import about
 from processing.sensor import noise
 from recordings.errors import BadInput
-from recordings.geometry import CameraModel, nearest_rotation, rotation_exp
+from recordings.geometry import CameraModel, nearest_rotation
 from recordings.progress import Progress
 from recordings.records import RgbdFrame
 from recordings.tracks import ObjectShape, ObjectTrack, Status
@@ -316,7 +317,7 @@ def align_to_surface(
             if near.sum() < 10:
                 break
             step = _gauss_newton(moved[near], surface, nearest[near])
-            at = _exp(step) @ at
+            at = about(np.zeros(3), step[:3], step[3:]) @ at
             if float(np.abs(step).max()) < s.still:
                 break
     moved = points_m @ at[:3, :3].T + at[:3, 3]
@@ -335,12 +336,6 @@ def _gauss_newton(moved_m: Float[Array, "k 3"], surface: Surface, nearest: Int[A
     hessian = rows.T @ rows
     gradient = rows.T @ (gap * normals).sum(1)
     return -np.linalg.solve(hessian + 1e-9 * np.trace(hessian) * np.eye(6), gradient)
-
-
-def _exp(step: Float[Array, "6"]) -> Float[Array, "4 4"]:
-    out = np.eye(4)
-    out[:3, :3], out[:3, 3] = rotation_exp(step[:3]), step[3:]
-    return out
 
 
 def covariance_of(

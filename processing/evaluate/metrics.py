@@ -210,16 +210,15 @@ def rollout_errors(
     """Position (m, of the point `center_m` of the estimated object) and rotation (rad) error of each step after the
     first, NaN where the truth has ended. True poses are interpolated, and moved on the object's side so that they meet
     the rollout at its first pose. None where the truth does not reach the start."""
-    from scipy.spatial.transform import Rotation, Slerp
+    from scipy.spatial.transform import Rotation
+
+    from processing.motion.interpolate import straight_between
 
     known = np.isfinite(true[:, 0, 0])
     if known.sum() < 2 or not true_s[known][0] <= rolled_s[0] + 1e-6 <= true_s[known][-1] + 1e-6:
         return None
-    times, turns = true_s[known], Slerp(true_s[known], Rotation.from_matrix(true[known, :3, :3]))
-    inside = np.clip(rolled_s, times[0], times[-1])
-    met = np.tile(np.eye(4), (len(rolled_s), 1, 1))
-    met[:, :3, :3] = turns(inside).as_matrix()
-    met[:, :3, 3] = np.stack([np.interp(inside, times, true[known, k, 3]) for k in range(3)], 1)
+    times = true_s[known]
+    met = straight_between(times, true[known], np.clip(rolled_s, times[0], times[-1]))
     met = met @ (np.linalg.inv(met[0]) @ rolled[0])
     place = [p[:, :3, :3] @ center_m + p[:, :3, 3] for p in (rolled, met)]
     position = np.linalg.norm(place[0] - place[1], axis=1)

@@ -16,6 +16,7 @@ from numpy import ndarray as Array
 from processing.evaluate.score import TossScore
 from processing.evaluate.table import Row
 from processing.motion.frame_phases import Phase
+from processing.motion.thresholds import MOVING_M_S
 from recordings.results.folder import Results
 from recordings.results.track_notes import find_notes
 from recordings.tracks import ObjectTrack
@@ -172,7 +173,7 @@ def _of_the_motion(e: TossDiagnostics, i: int) -> list[str]:
     if phase == "impact":
         return ["it is at an impact: the motion changes between two frames"]
     speed = speeds_m_s(e.track)
-    usual = _usual(speed[speed > 0.1]) if (speed > 0.1).any() else np.inf
+    usual = _usual(speed[speed > MOVING_M_S]) if (speed > MOVING_M_S).any() else np.inf
     if speed[i] > MUCH * usual:
         return [f"it is fast, {speed[i]:.1f} m/s (usually {usual:.1f} in motion), so likely blurred"]
     return ["a hand holds it, and hides a part"] if phase == "held" else []

@@ -2,7 +2,9 @@
 
 Which law holds differs by who asks: constant spin and a straight centre between two frames (`between`), a ballistic
 centre ahead (`moved`), a change of motion that goes on (`carried_on`), a parabola through three frames of a finished
-track (`pose_at`), corrections that vary slowly (`blended`). They stand side by side so that one can take over.
+track (`pose_at`), straight ways through a dense series (`straight_between`), corrections that vary slowly (`blended`).
+They stand side by side so that one can take over. `trajectory.resampled` is `straight_between` for a PoseSeries, by
+other arithmetic: to the last bit the two differ.
 """
 
 from __future__ import annotations
@@ -14,7 +16,7 @@ from jaxtyping import Float, Int
 from numpy import ndarray as Array
 from scipy.spatial.transform import Rotation, Slerp
 
-from processing.motion.impacts import EXTRAPOLATION_IMPACT_M_S, EXTRAPOLATION_IMPACT_RAD_S, FREE_M_S2
+from processing.motion.thresholds import EXTRAPOLATION_IMPACT_M_S, EXTRAPOLATION_IMPACT_RAD_S, FREE_M_S2
 from recordings.geometry import rotation_exp, rotation_log
 from recordings.tracks import ObjectTrack
 
@@ -80,6 +82,17 @@ def between(
     out[:3, :3] = rotation_exp(turn_between(after, before) * share) @ before[:3, :3]
     x0, x1 = (p[:3, :3] @ center_m + p[:3, 3] for p in (before, after))
     out[:3, 3] = x0 + share * (x1 - x0) - out[:3, :3] @ center_m
+    return out
+
+
+def straight_between(
+    times_s: Float[Array, " n"], poses: Float[Array, "n 4 4"], at_s: Float[Array, " t"]
+) -> Float[Array, "t 4 4"]:
+    """The poses at times within those of a dense series: rotations along the geodesic, origins straight."""
+    turns = Slerp(times_s, Rotation.from_matrix(poses[:, :3, :3]))
+    out = np.tile(np.eye(4), (len(at_s), 1, 1))
+    out[:, :3, :3] = turns(at_s).as_matrix()
+    out[:, :3, 3] = np.stack([np.interp(at_s, times_s, poses[:, k, 3]) for k in range(3)], 1)
     return out
 
 

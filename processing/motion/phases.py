@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray as Array
 
+from processing.motion.thresholds import LEAST_REST_SIGMA_M, LEAST_REST_SIGMA_RAD
 from processing.motion.trajectory import PoseSeries, differences, rotation_vectors
 from recordings.constants import GRAVITY_M_S2, MAD_TO_SIGMA
 
@@ -111,8 +112,8 @@ def spin_residual(series: PoseSeries, inertia: Float[Array, "3 3"]) -> Float[Arr
 
 def _rest_misfit(series: PoseSeries, noise: Noise) -> Float[Array, "n n"]:
     turned = rotation_vectors(series.rotation[-1].T @ series.rotation)
-    position = _line_misfit(series.time_s, series.position_m, 0) / max(noise.position_m, 3e-4) ** 2
-    return position + _line_misfit(series.time_s, turned, 0) / max(noise.rotation_rad, 5e-3) ** 2
+    position = _line_misfit(series.time_s, series.position_m, 0) / max(noise.position_m, LEAST_REST_SIGMA_M) ** 2
+    return position + _line_misfit(series.time_s, turned, 0) / max(noise.rotation_rad, LEAST_REST_SIGMA_RAD) ** 2
 
 
 def find_phases(series: PoseSeries, inertia: Float[Array, "3 3"], noise: Noise | None = None) -> Phases:

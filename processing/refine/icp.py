@@ -15,9 +15,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32
 from numpy import ndarray as Array
 
+from processing.motion.tangents import about
 from processing.sensor import noise
 from recordings.constants import MAD_TO_SIGMA
-from recordings.geometry import CameraModel, rotation_exp, skew
+from recordings.geometry import CameraModel, skew
 from recordings.robust import tukey_weight
 from recordings.tracks import ObjectShape
 
@@ -109,7 +110,7 @@ def align_frame(
         arm = in_object - surface.centre_m
         move, held = _solve(arm, gap, normal, use, surface.radius_m, reach_m, config, known, gone)
         gone += np.concatenate([move[:3] * surface.radius_m, move[3:]])
-        pose = pose @ _about(surface.centre_m, move)
+        pose = pose @ about(surface.centre_m, move[:3], move[3:])
         if np.linalg.norm(move[:3]) < 1e-5 and np.linalg.norm(move[3:]) < 1e-6:
             break
     _, gap, _, facing = _matches(surface, points_camera_m, pose)
@@ -216,14 +217,6 @@ def _known(
     to[3:, :3], to[3:, 3:] = -turn.T @ skew(turn @ surface.centre_m), turn.T
     least = np.diag(np.repeat(LEAST_SIGMA, 3) ** 2)
     return np.asarray(np.linalg.inv(to @ (covariance + least) @ to.T))
-
-
-def _about(centre_m: Float[Array, "3"], move: Float[Array, "6"]) -> Float[Array, "4 4"]:
-    """Rigid motion by a rotation vector about a centre and a shift."""
-    out = np.eye(4)
-    out[:3, :3] = rotation_exp(move[:3])
-    out[:3, 3] = centre_m - out[:3, :3] @ centre_m + move[3:]
-    return out
 
 
 def _judge(

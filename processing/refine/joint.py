@@ -22,6 +22,7 @@ from numpy import ndarray as Array
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
+from processing.motion.tangents import about
 from processing.refine.icp import ShapeSurface
 from processing.refine.joint_terms import (
     Block,
@@ -34,7 +35,6 @@ from processing.refine.joint_terms import (
     views_block,
 )
 from processing.sensor import noise
-from recordings.geometry import rotation_exp
 from recordings.tracks import ObjectShape
 
 
@@ -133,14 +133,6 @@ def _costs(blocks: Sequence[Block]) -> dict[str, float]:
     for block in blocks:
         found[block.name] = found.get(block.name, 0.0) + float(block.weight @ block.residual**2)
     return found
-
-
-def about(center_m: Float[Array, "3"], turn: Float[Array, "3"], shift_m: Float[Array, "3"]) -> Float[Array, "4 4"]:
-    """A small motion in object axes: a turn about the centre, then a shift."""
-    out = np.eye(4)
-    out[:3, :3] = rotation_exp(turn)
-    out[:3, 3] = center_m - out[:3, :3] @ center_m + shift_m
-    return out
 
 
 def _blocks(

@@ -7,8 +7,8 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray as Array
 
 from processing.motion import se3_kernels as se3
-from processing.motion.impacts import LATE_DEPTH_IMPACT_M_S
 from processing.motion.interpolate import between, turn_between
+from processing.motion.thresholds import LATE_DEPTH_IMPACT_M_S
 from processing.track.beam import LEAST_DELAY_S, Scene
 
 

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 import trimesh
 
+from processing.motion.tangents import about
 from processing.refine.icp import ShapeSurface
-from processing.refine.joint import FrameData, JointConfig, World, about, solve_jointly
+from processing.refine.joint import FrameData, JointConfig, World, solve_jointly
 from processing.refine.joint_terms import Block, Controls, depth_block, flight_block, plane_block, rest_block
 from recordings.geometry import rotation_angle_rad, rotation_exp
 from recordings.tracks import ObjectShape

@@ -24,13 +24,12 @@ from numpy import ndarray as Array
 
 from processing.contact.physics.loss import REFERENCE_MASS_KG
 from processing.motion.phases import Noise
+from processing.motion.smoother import FLIGHT_CHANGE_M_S, FLIGHT_CHANGE_RAD_S
 from processing.motion.trajectory import rotation_matrices, rotation_vectors
 from recordings.constants import GRAVITY_M_S2
 
 STEP_S = 1 / 592
 """Of the rollouts: in steps of 1/148 s friction comes out a tenth lower."""
-FLIGHT_CHANGE_M_S, FLIGHT_CHANGE_RAD_S = 0.004, 0.05
-"""What free flight may leave unexplained in the velocities of neighbouring frames, as in smoother.py."""
 ROTATION, POSITION, SPIN, VELOCITY = (slice(i, i + 3) for i in range(0, 12, 3))
 """Places in a state's error: turn (object axes), position, spin, velocity."""
 

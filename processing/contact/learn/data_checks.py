@@ -15,8 +15,8 @@ from jaxtyping import Float
 from numpy import ndarray as Array
 from scipy.spatial.transform import Rotation
 
-from processing.motion.impacts import DATA_CHECK_IMPACT_M_S
 from processing.motion.phases import LEAST_SIGMA_M, Phases
+from processing.motion.thresholds import DATA_CHECK_IMPACT_M_S
 from processing.motion.trajectory import PoseSeries, differences
 from recordings.constants import GRAVITY_M_S2, MAD_TO_SIGMA
 from recordings.errors import BadInput

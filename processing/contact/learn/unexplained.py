@@ -23,12 +23,12 @@ from processing.contact.physics.loss import (
     point_velocity,
 )
 from processing.contact.physics.solver import solve_cones
+from processing.motion.thresholds import UNEXPLAINED_IMPACT_M_S
 from recordings.constants import MAD_TO_SIGMA
 
 REACH_M = 0.01
 """A point this high above the plane after the step may still have touched it during the step."""
 GENEROUS_FRICTION = 1.2
-LEAST_M_S = 0.35
 SIGMAS = 6.0
 FAR = 1e3
 """Cost of an impulse per metre beyond the reach."""
@@ -55,7 +55,7 @@ def unexplained_m_s(data: StepData, body: Body, contacts: int) -> Float[Tensor, 
 
 
 def unexplained_rows(data: StepData, body: Body, contacts: int) -> Bool[Tensor, " n"]:
-    """Transitions that the plane cannot explain: beyond LEAST_M_S and beyond SIGMAS of what is usual in this data."""
+    """Transitions that the plane cannot explain: beyond UNEXPLAINED_IMPACT_M_S and SIGMAS of what is usual here."""
     left = unexplained_m_s(data, body, contacts)
     usual = MAD_TO_SIGMA * left.median()
-    return left > torch.clamp(SIGMAS * usual, min=LEAST_M_S)
+    return left > torch.clamp(SIGMAS * usual, min=UNEXPLAINED_IMPACT_M_S)

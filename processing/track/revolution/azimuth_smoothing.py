@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray as Array
 
+from processing.motion.thresholds import AZIMUTH_FLIGHT_M_S, CARRIED_AXIS_M, CARRIED_AXIS_RAD
 from processing.track.beam import Scene
 from processing.track.revolution.rolling import ExpectedSteps, Grounded, RollConfig, rolled
 from recordings.geometry import rotation_log
@@ -39,11 +40,11 @@ class SteadyConfig:
     """Cells that a view turns by in one step."""
     flight_weight: float = 4.0
     """Weight of a change of spin in free flight, against one elsewhere."""
-    flight_m_s: float = 0.15
+    flight_m_s: float = AZIMUTH_FLIGHT_M_S
     """A change of velocity, beyond gravity's, below this is free flight."""
     roll: RollConfig = field(default_factory=RollConfig)
-    held_rad: float = 0.05
-    held_m: float = 0.006
+    held_rad: float = CARRIED_AXIS_RAD
+    held_m: float = CARRIED_AXIS_M
     """From view to view, an axis that moves as the robot's hand does within these is carried ..."""
     carried_rad: float = 0.004
     """... and turns in it by no more than this (standard deviation)."""
