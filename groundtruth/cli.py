@@ -121,7 +121,7 @@ def _work(args: argparse.Namespace) -> Outcome:
 
 
 def _tosses(session: Any, chosen: str | None) -> list[int]:
-    from groundtruth.session_sightings import mono_cameras
+    from groundtruth.session_detections import mono_cameras
 
     if chosen is None:
         found = [t for t in session.tosses if mono_cameras(session.toss(t))]

@@ -33,7 +33,7 @@ CORNERS = np.array([[-0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [-0.5, 
 
 
 @dataclass(frozen=True)
-class WitnessConfig:
+class D455RefinementConfig:
     family: str = "tag36h11"
     sure_frames: int = 12
     """Frames of a toss whose pose is well known that are looked at, spread over it."""
@@ -50,7 +50,7 @@ class WitnessConfig:
     flip_rad: float = 0.15
     """Where the turn is less sure than this, a single tag, with its two solutions, does not do."""
     least_tags: int = 12
-    """Sightings at known poses below which nothing can be said of this camera."""
+    """Detections at known poses below which nothing can be said of this camera."""
     huber: float = 2.0
     too_far: float = 5.0
     """A frame whose corners stay off by this many standard deviations (median) is left as it was;"""
@@ -59,7 +59,7 @@ class WitnessConfig:
 
 
 @dataclass(frozen=True, eq=False)
-class Witness:
+class D455Refinement:
     """`off_m`, `off_rad`: how far the D455 stands from its place in the calibration. `corner_px`: median distance of
     its corners from where the mono cameras' poses put them, where those are sure. `offset_s`: what is to be added to
     the mono cameras' stamps so that the poses of moving frames meet the D455's view, and its standard deviation."""
@@ -68,19 +68,19 @@ class Witness:
     off_m: float
     off_rad: float
     corner_px: float
-    sightings: int
+    detections: int
     offset_s: float
     offset_std_s: float
 
     @property
     def frames(self) -> int:
-        return int(sum(t.witnessed.sum() for t in self.tosses.values()))
+        return int(sum(t.refined.sum() for t in self.tosses.values()))
 
     def document(self) -> dict[str, float | int]:
         return {
             "frames": self.frames,
             "corner_px": self.corner_px,
-            "sightings_at_sure_poses": self.sightings,
+            "sightings_at_sure_poses": self.detections,
             "camera_off_m": self.off_m,
             "camera_off_rad": self.off_rad,
             "mono_offset_ms": 1e3 * self.offset_s,
@@ -107,7 +107,7 @@ class ColorTags:
 
 @dataclass(frozen=True, eq=False)
 class _Place:
-    """The D455 as its sightings at known poses have it."""
+    """The D455 as its detections at known poses have it."""
 
     camera_from_world: Float[Array, "4 4"]
     short_px: float
@@ -116,14 +116,14 @@ class _Place:
     late_std_s: float
 
 
-def witness(
+def refine_by_d455(
     session: Session,
     truths: Mapping[int, TossTruth],
     solved: Solved,
     limits: TrackedLimits,
-    config: WitnessConfig,
+    config: D455RefinementConfig,
     progress: Progress,
-) -> Witness | None:
+) -> D455Refinement | None:
     """Open poses corrected by what the D455 saw. None where nothing is open, or its place or tags are not known."""
     calibration = session.calibration
     wanted = {toss: _wanted(truth, config) for toss, truth in truths.items()}
@@ -133,19 +133,19 @@ def witness(
     world = calibration.find("world", model.frame)
     if world is None:
         return None
-    seen = _sightings(session, wanted, solved, config, progress)
-    return by_sightings(model, np.linalg.inv(world.matrix), seen, truths, limits, config)
+    seen = _detections(session, wanted, solved, config, progress)
+    return by_detections(model, np.linalg.inv(world.matrix), seen, truths, limits, config)
 
 
-def by_sightings(
+def by_detections(
     model: CameraModel,
     camera_from_world: Float[Array, "4 4"],
     seen: Sequence[ColorTags],
     truths: Mapping[int, TossTruth],
     limits: TrackedLimits,
-    config: WitnessConfig,
-) -> Witness | None:
-    """Open poses corrected by these sightings. None where too few of them are at poses that are sure."""
+    config: D455RefinementConfig,
+) -> D455Refinement | None:
+    """Open poses corrected by these detections. None where too few of them are at poses that are sure."""
     sure = [s for s in seen if not truths[s.toss].open[s.frame]]
     if sum(s.tags for s in sure) < config.least_tags:
         return None
@@ -157,10 +157,10 @@ def by_sightings(
     off = se3.log((place.camera_from_world @ np.linalg.inv(camera_from_world))[None])[0]
     off_rad, off_m = (float(np.linalg.norm(part)) for part in np.split(off, 2))
     seen_at_sure = sum(s.tags for s in sure)
-    return Witness(corrected, off_m, off_rad, left_px, seen_at_sure, -place.late_s, place.late_std_s)
+    return D455Refinement(corrected, off_m, off_rad, left_px, seen_at_sure, -place.late_s, place.late_std_s)
 
 
-def _wanted(truth: TossTruth, config: WitnessConfig) -> list[int]:
+def _wanted(truth: TossTruth, config: D455RefinementConfig) -> list[int]:
     """Open frames, and some of the others."""
     placed = np.isfinite(truth.world_from_tagged).all(axis=(1, 2))
     sure = np.flatnonzero(placed & ~truth.open)
@@ -168,8 +168,8 @@ def _wanted(truth: TossTruth, config: WitnessConfig) -> list[int]:
     return sorted({*np.flatnonzero(placed & truth.open).tolist(), *some.tolist()})
 
 
-def _sightings(
-    session: Session, wanted: Mapping[int, list[int]], solved: Solved, config: WitnessConfig, progress: Progress
+def _detections(
+    session: Session, wanted: Mapping[int, list[int]], solved: Solved, config: D455RefinementConfig, progress: Progress
 ) -> list[ColorTags]:
     total = sum(map(len, wanted.values()))
     lists = detect_tags(_images(session, wanted), config.family, None, progress, response="srgb", total=total)
@@ -218,7 +218,7 @@ def _placed(
     known: Float[Array, "4 4"],
     sure: list[ColorTags],
     truths: Mapping[int, TossTruth],
-    config: WitnessConfig,
+    config: D455RefinementConfig,
 ) -> tuple[_Place, float]:
     """The camera's place (a twist on its left), how short edges appear, how late the poses come, and the noise against
     what is stated: robust Gauss-Newton over all corners at poses that are sure. Also the median distance left."""
@@ -265,11 +265,11 @@ def _corrected(
     truth: TossTruth,
     seen: list[ColorTags],
     limits: TrackedLimits,
-    config: WitnessConfig,
+    config: D455RefinementConfig,
 ) -> TossTruth:
     """Every open frame that the D455 saw tags in: its pose and covariance with them."""
     poses, covariance = truth.world_from_tagged.copy(), truth.covariance.copy()
-    witnessed = np.zeros(len(poses), dtype=bool)
+    refined = np.zeros(len(poses), dtype=bool)
     floor = np.diag([config.open_rad**2] * 3 + [config.open_m**2] * 3)
     for s in seen:
         if not truth.open[s.frame]:
@@ -277,13 +277,13 @@ def _corrected(
         answer = _fused(model, place, s, poses[s.frame], covariance[s.frame] + floor, config)
         if answer is not None:
             poses[s.frame], covariance[s.frame] = answer
-            witnessed[s.frame] = True
+            refined[s.frame] = True
     return replace(
         truth,
         world_from_tagged=poses,
         covariance=covariance,
         status=statuses(covariance, limits),
-        witnessed=witnessed,
+        refined=refined,
     )
 
 
@@ -293,7 +293,7 @@ def _fused(
     seen: ColorTags,
     pose: Float[Array, "4 4"],
     covariance: Float[Array, "6 6"],
-    config: WitnessConfig,
+    config: D455RefinementConfig,
 ) -> tuple[Float[Array, "4 4"], Float[Array, "6 6"]] | None:
     """The pose that agrees with the corners and with where it was thought to be; the posterior's covariance.
 

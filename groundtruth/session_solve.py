@@ -18,11 +18,11 @@ from groundtruth import se3
 from groundtruth.factors import Between
 from groundtruth.flight import FlightConfig, Order, arcs_of, center_of_mass
 from groundtruth.graph import Graph, Solution, SolverConfig, Undetermined, covariances, solve
-from groundtruth.session_sightings import Roles, Sightings, TagSeen
+from groundtruth.session_detections import Detections, Roles, TagSeen
 from groundtruth.tagslam.config import BodyEntry, CameraEntry, TagEntry, TagSlamConfig
-from groundtruth.tagslam.initialisation import Growth, chain
+from groundtruth.tagslam.initialisation import Initialisation, chain
 from groundtruth.tagslam.problem import Key, Observation, Problem, camera_key, planar_poses, tag_key
-from groundtruth.tagslam.solve import TagSlamSettings, build_graph, grow
+from groundtruth.tagslam.solve import TagSlamSettings, build_graph, initialise
 from groundtruth.tagslam.yaml_pieces import NoisyPose
 from groundtruth.tension import tension
 from recordings.constants import MAD_TO_SIGMA
@@ -111,7 +111,7 @@ class Solved:
 
 
 def solve_session(
-    sightings: Sightings,
+    detections: Detections,
     roles: Roles,
     sizes_m: Mapping[int, float],
     calibration: RigCalibration,
@@ -121,17 +121,17 @@ def solve_session(
 ) -> Solved:
     """Raises Undetermined, in words of cameras, tags and instants, where something is not fixed by what was seen."""
     config, progress = config or SolveConfig(), progress or Silent()
-    problem = _problem(sightings, roles, sizes_m, calibration, layout, config)
-    growth = Growth(problem, TagSlamSettings().grow)
+    problem = _problem(detections, roles, sizes_m, calibration, layout, config)
+    initial = Initialisation(problem, TagSlamSettings().initialisation)
     settings = TagSlamSettings(
-        solver=SolverConfig(huber_px=config.huber_px), growing_solver=SolverConfig(6, config.huber_px, weakest=0.0)
+        solver=SolverConfig(huber_px=config.huber_px), initial_solver=SolverConfig(6, config.huber_px, weakest=0.0)
     )
-    grow(problem, growth, settings, progress)
-    if not any(key[:2] == ("body", BODY) for key in growth.poses):
-        raise Undetermined(sorted(c.name for c in problem.config.cameras), _nothing_connects(problem, growth))
-    graph, index = build_graph(problem, growth.poses, settings)
-    order = _order(sightings, index)
-    drifting = _let_cameras_drift(graph, problem, index, sightings, config)
+    initialise(problem, initial, settings, progress)
+    if not any(key[:2] == ("body", BODY) for key in initial.poses):
+        raise Undetermined(sorted(c.name for c in problem.config.cameras), _nothing_connects(problem, initial))
+    graph, index = build_graph(problem, initial.poses, settings)
+    order = _order(detections, index)
+    drifting = _let_cameras_drift(graph, problem, index, detections, config)
     solution = solve(graph, settings.solver)
     solution, loosened, left = _without_wrong_places(graph, solution, problem, index, config, settings.solver)
     middle = np.mean([solution.poses[index[tag_key(i)]][:3, 3] for i in roles.body if tag_key(i) in index], axis=0)
@@ -143,12 +143,12 @@ def solve_session(
             break
         graph.start = list(solution.poses)
         solution = solve(graph, settings.solver)
-    found = _solved(problem, sightings, graph, index, solution, drifting, center, growth)
+    found = _solved(problem, detections, graph, index, solution, drifting, center, initial)
     return _widened(replace(found, displaced=loosened), max(1.0, left))
 
 
-def _nothing_connects(problem: Problem, growth: Growth) -> str:
-    placed = [c.name for c in problem.config.cameras if camera_key(c.name) in growth.poses]
+def _nothing_connects(problem: Problem, initial: Initialisation) -> str:
+    placed = [c.name for c in problem.config.cameras if camera_key(c.name) in initial.poses]
     if not placed:
         return (
             "no camera's place is known and none sees a table tag whose place is known; "
@@ -162,7 +162,7 @@ def _noise(sigma: tuple[float, float]) -> Float[Array, "6 6"]:
 
 
 def _problem(
-    sightings: Sightings,
+    detections: Detections,
     roles: Roles,
     sizes_m: Mapping[int, float],
     calibration: RigCalibration,
@@ -170,7 +170,7 @@ def _problem(
     config: SolveConfig,
 ) -> Problem:
     """The session as TagSLAM would see it: a static world with the cameras and the table, a moving tagged body."""
-    counts = {i: sum(s.tag.tag_id == i for s in sightings.seen) for i in roles.body}
+    counts = {i: sum(s.tag.tag_id == i for s in detections.seen) for i in roles.body}
     reference = max(sorted(counts), key=lambda i: counts[i])
     table = {t.tag_id: t for t in calibration.table_tags if t.tag_id in roles.table}
     tags = {
@@ -187,10 +187,10 @@ def _problem(
         on_body = {i: TagEntry(i, sizes_m[i], None) for i in roles.body}
         on_body[reference] = replace(on_body[reference], pose=NoisyPose(FLIP, 1e6 * np.eye(6)))
     body = BodyEntry(BODY, False, None, 0.0, on_body, frozenset())
-    names = sorted({camera for cameras in sightings.frames.values() for camera in cameras})
+    names = sorted({camera for cameras in detections.frames.values() for camera in cameras})
     cameras = tuple(_camera(name, calibration, config) for name in names)
     tagslam = TagSlamConfig(cameras, (world, body), None, 0.3, (), (), (), (), (), 2)
-    observations = _observations(sightings, tagslam, config)
+    observations = _observations(detections, tagslam, config)
     stamps = tuple(sorted({o.stamp_ns for o in observations}))
     every = {**tags, **on_body}
     owner = {**dict.fromkeys(tags, world), **dict.fromkeys(on_body, body)}
@@ -204,11 +204,11 @@ def _camera(name: str, calibration: RigCalibration, config: SolveConfig) -> Came
     return CameraEntry(name, model, f"/{name}/image", WORLD, known, (1e-5, 1e-5))
 
 
-def _observations(sightings: Sightings, config: TagSlamConfig, settings: SolveConfig) -> tuple[Observation, ...]:
+def _observations(detections: Detections, config: TagSlamConfig, settings: SolveConfig) -> tuple[Observation, ...]:
     owner = {i: body for body in config.bodies for i in body.tags}
     out: list[Observation] = []
     for number, camera in enumerate(config.cameras):
-        mine = [s for s in sightings.seen if s.camera == camera.name and s.tag.tag_id in owner]
+        mine = [s for s in detections.seen if s.camera == camera.name and s.tag.tag_id in owner]
         sizes = np.array([owner[s.tag.tag_id].tags[s.tag.tag_id].size_m for s in mine])
         corners = np.array([s.tag.corners_px for s in mine]).reshape(-1, 4, 2)
         for s, (poses, errors) in zip(mine, planar_poses(camera.model, sizes, corners), strict=True):
@@ -231,9 +231,9 @@ def _observations(sightings: Sightings, config: TagSlamConfig, settings: SolveCo
     return tuple(out)
 
 
-def _order(sightings: Sightings, index: Mapping[Key, int]) -> Order:
-    toss_of = {s.time_ns: s.toss for s in sightings.seen}
-    found: dict[int, list[tuple[int, int]]] = {toss: [] for toss in sightings.frames}
+def _order(detections: Detections, index: Mapping[Key, int]) -> Order:
+    toss_of = {s.time_ns: s.toss for s in detections.seen}
+    found: dict[int, list[tuple[int, int]]] = {toss: [] for toss in detections.frames}
     for key, number in index.items():
         if key[:2] == ("body", BODY):
             found[toss_of[key[2]]].append((key[2], number))
@@ -244,12 +244,12 @@ def _order(sightings: Sightings, index: Mapping[Key, int]) -> Order:
 
 
 def _let_cameras_drift(
-    graph: Graph, problem: Problem, index: Mapping[Key, int], sightings: Sightings, config: SolveConfig
+    graph: Graph, problem: Problem, index: Mapping[Key, int], detections: Detections, config: SolveConfig
 ) -> dict[tuple[str, int], int]:
     """Each camera gets a pose of its own in each toss, tied to its place: a bumped one shows."""
-    if len(sightings.frames) < 2:
+    if len(detections.frames) < 2:
         return {}
-    toss_of = {s.time_ns: s.toss for s in sightings.seen}
+    toss_of = {s.time_ns: s.toss for s in detections.seen}
     placed = [o for o in problem.observations if all(k in index for k in chain(problem, o))]
     drifting: dict[tuple[str, int], int] = {}
     for i, (o, p) in enumerate(zip(placed, graph.projections, strict=True)):
@@ -300,25 +300,25 @@ def _widened(solved: Solved, times: float) -> Solved:
 
 def _solved(
     problem: Problem,
-    sightings: Sightings,
+    detections: Detections,
     graph: Graph,
     index: Mapping[Key, int],
     solution: Solution,
     drifting: Mapping[tuple[str, int], int],
     center: Float[Array, "3"],
-    growth: Growth,
+    initial: Initialisation,
 ) -> Solved:
-    order = _order(sightings, index)
+    order = _order(detections, index)
     poses = solution.poses
     names = {c.name: index[camera_key(c.name)] for c in problem.config.cameras if camera_key(c.name) in index}
-    corners = _corners(problem, sightings, graph, index, solution)
+    corners = _corners(problem, detections, graph, index, solution)
     factor = _noise_factor(corners)
     wanted = [int(n) for _, numbers in order.values() for n in numbers] + list(names.values())
     spread = dict(zip(wanted, covariances(solution, wanted) * factor**2, strict=True))
     in_flight = {arc.poses[1] for arc in graph.arcs if min(arc.weight, arc.turn_weight) > 0.4}
     seen_by: dict[int, list[TagSeen]] = {}
     on_body = problem.config.body(BODY).tags
-    for s in sightings.seen:
+    for s in detections.seen:
         if s.tag.tag_id in on_body:
             seen_by.setdefault(s.time_ns, []).append(s)
     tracks = {
@@ -341,7 +341,7 @@ def _solved(
         moved=_moved({key: poses[number] for key, number in drifting.items()}),
         center_m=center,
         corners=corners,
-        unplaced=tuple(" ".join(k[:2]) for k in growth.missing()),
+        unplaced=tuple(" ".join(k[:2]) for k in initial.missing()),
         table_off_m={
             i: float(np.linalg.norm(poses[index[tag_key(i)]][:3, 3] - tag.pose.pose[:3, 3]))
             for i, tag in problem.config.body(WORLD).tags.items()
@@ -368,9 +368,9 @@ def _apart(a: Float[Array, "4 4"], b: Float[Array, "4 4"]) -> tuple[float, float
 
 
 def _corners(
-    problem: Problem, sightings: Sightings, graph: Graph, index: Mapping[Key, int], solution: Solution
+    problem: Problem, detections: Detections, graph: Graph, index: Mapping[Key, int], solution: Solution
 ) -> tuple[Corner, ...]:
-    toss_of = {s.time_ns: s.toss for s in sightings.seen}
+    toss_of = {s.time_ns: s.toss for s in detections.seen}
     placed = [o for o in problem.observations if all(k in index for k in chain(problem, o))]
     left = -solution.residuals_px
     return tuple(

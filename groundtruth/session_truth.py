@@ -16,12 +16,12 @@ from jaxtyping import Float, Int64
 from numpy import ndarray as Array
 
 from groundtruth import se3
-from groundtruth.d455_tags import Witness, WitnessConfig, witness
+from groundtruth.d455_tags import D455Refinement, D455RefinementConfig, refine_by_d455
 from groundtruth.offset import Fit, object_from_tagged_by_mesh, tagged_frame
-from groundtruth.session_sightings import (
+from groundtruth.session_detections import (
     assign_roles,
+    enlarged,
     find_tags,
-    grown,
     measured_sizes_m,
     shared_times,
     shrink_px,
@@ -71,7 +71,7 @@ class SessionTruth:
     tosses: Mapping[int, TossTruth]
     verdict: Verdict
     sizes_m: Mapping[int, float]
-    witness: Witness | None = None
+    d455_refinement: D455Refinement | None = None
 
 
 def find_truth(
@@ -81,40 +81,40 @@ def find_truth(
     config, progress = config or TruthConfig(), progress or Silent()
     calibration = session.calibration
     offset_ns = clock_offset_ns(calibration.residuals, "mono")
-    sightings = find_tags(session, tosses, config.family, offset_ns, progress)
-    for camera in {c for cameras in sightings.frames.values() for c in cameras}:
+    detections = find_tags(session, tosses, config.family, offset_ns, progress)
+    for camera in {c for cameras in detections.frames.values() for c in cameras}:
         calibration.camera(camera)
-    sightings, spread_ns = shared_times(sightings, round(config.sync_s * 1e9))
-    roles = assign_roles(sightings, calibration, config.ignored, config.layout)
-    triangulated = triangulated_tags(sightings, calibration)
+    detections, spread_ns = shared_times(detections, round(config.sync_s * 1e9))
+    roles = assign_roles(detections, calibration, config.ignored, config.layout)
+    triangulated = triangulated_tags(detections, calibration)
     measured = measured_sizes_m(triangulated, roles.body | roles.still)
     sizes, size_notes = _sizes(config, roles.body | roles.still, roles.body, measured)
     known = {t.tag_id: t.size_m for t in calibration.table_tags if t.tag_id in roles.table}
     known |= {i: s for i, s in sizes.items() if i in _given(config, roles.body)}
     short_px = shrink_px(triangulated, known)
-    sightings = grown(sightings, short_px)
+    detections = enlarged(detections, short_px)
     size_notes += (
         [f"tags' edges appear {short_px:.2f} px short; corners moved outwards by that"]
         if abs(short_px) >= 0.005
         else []
     )
     solved = _in_tagged_frame(
-        solve_session(sightings, roles, sizes, calibration, config.layout, progress=progress), config
+        solve_session(detections, roles, sizes, calibration, config.layout, progress=progress), config
     )
     size_notes += [f"time offset of the mono cameras applied: {offset_ns / 1e6:.2f} ms"] if offset_ns else []
     truths = {t: at_color_frames(t, session.toss(t).color().times_ns, solved, config.limits) for t in tosses}
     own = None
     if not config.mono_only:
-        own = witness(session, truths, solved, config.limits, WitnessConfig(config.family), progress)
-    notes = [*size_notes, *_witness_notes(truths, own)]
-    verdict = judge(solved, sightings, spread_ns, notes, calibration)
+        own = refine_by_d455(session, truths, solved, config.limits, D455RefinementConfig(config.family), progress)
+    notes = [*size_notes, *_refinement_notes(truths, own)]
+    verdict = judge(solved, detections, spread_ns, notes, calibration)
     if own is not None and (late := _late(own, session)):
         verdict = replace(verdict, warnings=(*verdict.warnings, late))
     final = {toss: t.without_guesses() for toss, t in (own.tosses if own is not None else truths).items()}
     return SessionTruth(solved, final, verdict, sizes, own)
 
 
-def _late(own: Witness, session: Session) -> str | None:
+def _late(own: D455Refinement, session: Session) -> str | None:
     """The stamps of the mono cameras, as the D455's view of the same motion has them."""
     if abs(own.offset_s) <= max(LATE_S, 4 * own.offset_std_s):
         return None
@@ -125,7 +125,7 @@ def _late(own: Witness, session: Session) -> str | None:
     )
 
 
-def _witness_notes(truths: Mapping[int, TossTruth], own: Witness | None) -> list[str]:
+def _refinement_notes(truths: Mapping[int, TossTruth], own: D455Refinement | None) -> list[str]:
     """What the D455's own view of the tags was good for."""
     still_open = sum(int(t.open.sum()) for t in truths.values())
     if own is None:
@@ -272,7 +272,7 @@ def truth_document(truth: SessionTruth, object_from_tagged: Transform | None) ->
         },
         "center_of_mass_tagged_m": solved.center_m.tolist(),
         "frames": {str(toss): _counts(t) for toss, t in truth.tosses.items()},
-        **({"d455_witness": truth.witness.document()} if truth.witness is not None else {}),
+        **({"d455_witness": truth.d455_refinement.document()} if truth.d455_refinement is not None else {}),
         "verdict": truth.verdict.document(),
     }
 

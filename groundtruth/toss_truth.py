@@ -33,14 +33,14 @@ class TrackedLimits:
 class TossTruth:
     """The body at the D455's colour frames; NaN where lost. Covariances are in the world: (rotation, translation), the
     turn about the body's origin. `open`: an impact or a gap lies round the frame, its covariance is that of a guess.
-    `witnessed`: the D455's own view of the tags has placed it. `soon`: the same poses a millisecond later."""
+    `refined`: the D455's own view of the tags has placed it. `soon`: the same poses a millisecond later."""
 
     time_ns: Int64[Array, " n"]
     world_from_tagged: Float[Array, "n 4 4"]
     covariance: Float[Array, "n 6 6"]
     status: tuple[Status, ...]
     open: Bool[Array, " n"]
-    witnessed: Bool[Array, " n"]
+    refined: Bool[Array, " n"]
     soon: Float[Array, "n 4 4"]
 
     def without_guesses(self) -> TossTruth:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from groundtruth.session_sightings import Sightings
+from groundtruth.session_detections import Detections
 from groundtruth.session_solve import Corner, Solved
 from recordings.tracks import RigCalibration
 
@@ -51,7 +51,7 @@ class Verdict:
 
 
 def judge(
-    solved: Solved, sightings: Sightings, spread_ns: int, notes: Sequence[str], calibration: RigCalibration
+    solved: Solved, detections: Detections, spread_ns: int, notes: Sequence[str], calibration: RigCalibration
 ) -> Verdict:
     by = _residuals(solved.corners)
     faults, warnings = [], []
@@ -86,15 +86,15 @@ def judge(
             "bumped; its place was estimated anew there. Run `toss-calibrate cameras` again before the next toss"
         )
     warnings += _displaced(solved) + _drift(solved, calibration)
-    warnings += _gaps(solved, sightings)
+    warnings += _gaps(solved, detections)
     if spread_ns > 100_000:
         warnings.append(
             f"the cameras' stamps of one trigger differ by up to {spread_ns / 1e6:.2f} ms: check the trigger"
         )
     if solved.unplaced:
         warnings.append(f"not connected to the rest and left out: {', '.join(solved.unplaced[:5])}")
-    if sightings.lost_images:
-        warnings.append(f"the tag detector died on {sightings.lost_images} images")
+    if detections.lost_images:
+        warnings.append(f"the tag detector died on {detections.lost_images} images")
     return Verdict(tuple(faults), tuple(warnings), tuple(notes), {"all": overall, **by})
 
 
@@ -149,10 +149,10 @@ def _drift(solved: Solved, calibration: RigCalibration) -> list[str]:
     return found
 
 
-def _gaps(solved: Solved, sightings: Sightings) -> list[str]:
+def _gaps(solved: Solved, detections: Detections) -> list[str]:
     """Frames without any tag of the body, and cameras that miss images."""
     found = []
-    for toss, cameras in sightings.frames.items():
+    for toss, cameras in detections.frames.items():
         every = np.unique(np.concatenate(list(cameras.values()))) if cameras else np.zeros(0, np.int64)
         blind = len(every) - len(solved.tracks[toss].time_ns)
         if blind:

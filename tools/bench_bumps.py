@@ -28,7 +28,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "groundtr
 
 from conftest import TossLab, lab
 
-from groundtruth.session_sightings import assign_roles, shared_times
+from groundtruth.session_detections import assign_roles, shared_times
 from groundtruth.session_solve import SolveConfig, Solved, solve_session
 from recordings.geometry import Transform
 
@@ -84,10 +84,10 @@ def session(number: int) -> tuple[TossLab, str | None, float]:
 
 def outcome(made: TossLab, threshold: float) -> Outcome:
     """The session solved with this threshold."""
-    sightings, _ = shared_times(made.sightings, 500_000)
-    roles = assign_roles(sightings, made.calibration, frozenset(), None)
+    detections, _ = shared_times(made.detections, 500_000)
+    roles = assign_roles(detections, made.calibration, frozenset(), None)
     sizes = dict.fromkeys(roles.body | roles.still, 0.07)
-    found = solve_session(sightings, roles, sizes, made.calibration, config=SolveConfig(place_tension=threshold))
+    found = solve_session(detections, roles, sizes, made.calibration, config=SolveConfig(place_tension=threshold))
     return Outcome(found.tension, found.displaced, *errors_mm(found, made))
 
 

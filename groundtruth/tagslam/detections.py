@@ -23,7 +23,7 @@ apriltag_msgs/Apriltag[] apriltags
 
 
 @dataclass(frozen=True, eq=False)
-class Sighting:
+class DetectedTag:
     """One tag in one image: corners (4, 2) in OpenCV's pixels, in TagSLAM's order (-,-), (+,-), (+,+), (-,+)."""
 
     tag_id: int
@@ -36,7 +36,7 @@ class Recording:
     """`frames[topic][stamp_ns]`: the tags of that image, empty where it shows none. `odometry[topic]`: stamps (n,) and
     poses (n, 4, 4)."""
 
-    frames: Mapping[str, Mapping[int, tuple[Sighting, ...]]]
+    frames: Mapping[str, Mapping[int, tuple[DetectedTag, ...]]]
     odometry: Mapping[str, tuple[Int64[Array, " n"], Float[Array, "n 4 4"]]]
 
     def odometry_at(self, topic: str, stamp_ns: int) -> Float[Array, "4 4"]:
@@ -67,11 +67,13 @@ def _read_npz(path: Path) -> Recording:
         with open_npz(path) as stored:
             data = {name: stored[name] for name in stored.files}
         topics = [_slashed(str(t)) for t in data["topics"]]
-        frames: dict[str, dict[int, tuple[Sighting, ...]]] = {}
+        frames: dict[str, dict[int, tuple[DetectedTag, ...]]] = {}
         for topic, stamp in zip(data["frame_topic"], data["frame_stamp_ns"], strict=True):
             frames.setdefault(topics[int(topic)], {})[int(stamp)] = ()
         for i, (topic, stamp) in enumerate(zip(data["topic"], data["stamp_ns"], strict=True)):
-            seen = Sighting(int(data["tag_id"][i]), int(data["hamming"][i]), data["corners_px"][i].astype(np.float64))
+            seen = DetectedTag(
+                int(data["tag_id"][i]), int(data["hamming"][i]), data["corners_px"][i].astype(np.float64)
+            )
             by_stamp = frames.setdefault(topics[int(topic)], {})
             by_stamp[int(stamp)] = (*by_stamp.get(int(stamp), ()), seen)
         odometry = {}
@@ -120,7 +122,7 @@ def _read_bag(path: Path) -> Recording:
 
 
 def _collect(reader: Any) -> Recording:
-    frames: dict[str, dict[int, tuple[Sighting, ...]]] = {}
+    frames: dict[str, dict[int, tuple[DetectedTag, ...]]] = {}
     odometry: dict[str, list[tuple[int, list[float]]]] = {}
     for connection, _, raw in reader.messages():
         kind = connection.msgtype.rsplit("/", 1)[-1]
@@ -133,7 +135,7 @@ def _collect(reader: Any) -> Recording:
             odometry.setdefault(_slashed(connection.topic), []).append((stamp, [p.x, p.y, p.z, q.x, q.y, q.z, q.w]))
             continue
         seen = tuple(
-            Sighting(int(t.id), int(t.hamming), np.array([[c.x, c.y] for c in t.corners])) for t in message.apriltags
+            DetectedTag(int(t.id), int(t.hamming), np.array([[c.x, c.y] for c in t.corners])) for t in message.apriltags
         )
         frames.setdefault(_slashed(connection.topic), {})[stamp] = seen
     if not frames:

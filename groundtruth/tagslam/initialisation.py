@@ -1,4 +1,4 @@
-"""First values for every pose, grown outwards from what the configuration knows.
+"""First values for every pose, initialised incrementally from what the configuration knows.
 
 A pose is placed once everything else in some observation's chain is placed. The chain of an observation is
 
@@ -27,7 +27,7 @@ EYE, RIG, BODY, TAG = range(4)
 
 
 @dataclass(frozen=True)
-class GrowConfig:
+class InitialisationConfig:
     most_proposers: int = 12
     """Observations that propose a pose, the largest tags first."""
     most_judges: int = 40
@@ -46,7 +46,7 @@ class GrowConfig:
 
 @dataclass(frozen=True)
 class Stage:
-    """How bold growing is: first what is certain, the rest only where nothing else is left."""
+    """How bold initialisation is: first what is certain, the rest only where nothing else is left."""
 
     ambiguous_too: bool = False
     """Also what a single tag shows whose two solutions are alike."""
@@ -55,7 +55,7 @@ class Stage:
     agreeing: float = 0.5
     """Share of the observations that must agree with a proposal."""
     drifted: bool = False
-    """Only where there is odometry: it drifts, so that a tag's early and late sightings disagree until it is placed."""
+    """Only where there is odometry: it drifts, so early and late detections of a tag disagree until it is placed."""
     at_rest: bool = False
     """Place a body with fake odometry where it was one stamp away."""
 
@@ -83,10 +83,10 @@ class _Ready:
     candidates: tuple[Float[Array, "k 4 4"], ...]
 
 
-class Growth:
+class Initialisation:
     """The poses placed so far, and the observations by the poses in their chains."""
 
-    def __init__(self, problem: Problem, config: GrowConfig) -> None:
+    def __init__(self, problem: Problem, config: InitialisationConfig) -> None:
         self.problem = problem
         self.config = config
         self.poses: dict[Key, Float[Array, "4 4"]] = {}

@@ -16,7 +16,7 @@ from numpy import ndarray as Array
 
 from groundtruth.factors import CORNERS
 from groundtruth.tagslam.config import BodyEntry, CameraEntry, TagEntry, TagSlamConfig
-from groundtruth.tagslam.detections import Recording, Sighting
+from groundtruth.tagslam.detections import DetectedTag, Recording
 from groundtruth.tagslam.synchronise import StampSet, approximate_sets, exact_sets
 from recordings.errors import BadInput
 from recordings.geometry import CameraModel
@@ -126,7 +126,7 @@ def _synchronised(config: TagSlamConfig, recording: Recording) -> tuple[list[Sta
 
 
 class _Collector:
-    """Turns sightings into observations; tags that the configuration does not place go to the default body."""
+    """Turns detections into observations; tags that the configuration does not place go to the default body."""
 
     def __init__(self, config: TagSlamConfig, recording: Recording) -> None:
         self.config = config
@@ -140,8 +140,8 @@ class _Collector:
         before = len(self.observations)
         for number, camera in enumerate(self.config.cameras):
             seen_here: set[int] = set()
-            for sighting in self.recording.frames[camera.tag_topic][stamps[camera.tag_topic]]:
-                observation = self._observe(stamp_ns, number, camera, sighting, seen_here)
+            for detected in self.recording.frames[camera.tag_topic][stamps[camera.tag_topic]]:
+                observation = self._observe(stamp_ns, number, camera, detected, seen_here)
                 if observation is None:
                     self.ignored += 1
                 else:
@@ -150,18 +150,18 @@ class _Collector:
         return len(self.observations) > before
 
     def _observe(
-        self, stamp_ns: int, number: int, camera: CameraEntry, sighting: Sighting, seen: set[int]
+        self, stamp_ns: int, number: int, camera: CameraEntry, detected: DetectedTag, seen: set[int]
     ) -> Observation | None:
         config = self.config
-        if sighting.hamming > config.max_hamming or _squashed(config, sighting.tag_id, camera, stamp_ns):
+        if detected.hamming > config.max_hamming or _squashed(config, detected.tag_id, camera, stamp_ns):
             return None
-        tag_id = _remapped(config, sighting.tag_id, camera, stamp_ns)
+        tag_id = _remapped(config, detected.tag_id, camera, stamp_ns)
         body = self.owner.get(tag_id) or _adopt(config, tag_id, self.tags, self.owner)
-        area = _area_px2(sighting.corners_px)
+        area = _area_px2(detected.corners_px)
         if body is None or tag_id in seen:
             return None
         tag, rig = self.tags[tag_id], config.body(camera.rig)
-        return Observation(stamp_ns, number, rig, body, tag, sighting.corners_px, *NOT_YET, area)
+        return Observation(stamp_ns, number, rig, body, tag, detected.corners_px, *NOT_YET, area)
 
     def observed(self) -> tuple[Observation, ...]:
         """All observations with their planar solutions. What is seen too flat or too small has none to start from; its
@@ -180,7 +180,7 @@ class _Collector:
 
 
 def unambiguous(config: TagSlamConfig, o: Observation) -> bool:
-    """Whether TagSLAM would start a pose from this sighting: seen from the front, or one solution is clearly better."""
+    """Whether TagSLAM would start a pose from this detection: from the front, or one solution is clearly better."""
     if len(o.candidates) == 0:
         return False
     if len(o.errors_px) < 2 or _view_angle_rad(o.candidates[0]) >= np.radians(config.ambiguous_deg):

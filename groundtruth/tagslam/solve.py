@@ -15,7 +15,7 @@ from groundtruth.factors import CORNERS, Between, Coordinate, Distance, Prior, P
 from groundtruth.graph import Graph, Solution, SolverConfig, Undetermined, solve
 from groundtruth.tagslam.config import DEFAULT_WIGGLE, BodyEntry, TagSlamConfig
 from groundtruth.tagslam.detections import Recording
-from groundtruth.tagslam.initialisation import STAGES, GrowConfig, Growth, chain
+from groundtruth.tagslam.initialisation import STAGES, Initialisation, InitialisationConfig, chain
 from groundtruth.tagslam.problem import (
     Key,
     Observation,
@@ -31,12 +31,12 @@ from recordings.progress import Progress, Silent
 
 @dataclass(frozen=True)
 class TagSlamSettings:
-    grow: GrowConfig = field(default_factory=GrowConfig)
+    initialisation: InitialisationConfig = field(default_factory=InitialisationConfig)
     solver: SolverConfig = field(default_factory=lambda: SolverConfig(huber_px=None))
     """Without a robust kernel by default: that is what TagSLAM answers to a configuration of its own."""
-    growing_solver: SolverConfig = field(default_factory=lambda: SolverConfig(iterations=6, weakest=0.0, huber_px=3.0))
-    """Between sweeps of growing, so that drift does not add up."""
-    solve_after_growth: float = 1.4
+    initial_solver: SolverConfig = field(default_factory=lambda: SolverConfig(iterations=6, weakest=0.0, huber_px=3.0))
+    """Between sweeps of the initialisation, so that drift does not add up."""
+    solve_after_ratio: float = 1.4
     """That is done when this many times as many poses are placed, or no more can be,"""
     solve_after: int = 300
     """or, while there are few poses, when one that does not move is among the new ones, or so many are new."""
@@ -79,12 +79,12 @@ def run_tag_slam(
 
 def solve_at_once(problem: Problem, settings: TagSlamSettings, progress: Progress) -> TagSlamResult:
     """All stamps in one graph."""
-    growth = Growth(problem, settings.grow)
-    grow(problem, growth, settings, progress)
-    graph, index = build_graph(problem, growth.poses, settings)
+    initial = Initialisation(problem, settings.initialisation)
+    initialise(problem, initial, settings, progress)
+    graph, index = build_graph(problem, initial.poses, settings)
     if not graph.projections:
-        raise Undetermined(sorted(_spoken(k) for k in growth.missing())[:3] or ["nothing"], _nothing_placed(problem))
-    return _result(problem, growth, index, solve(graph, settings.solver))
+        raise Undetermined(sorted(_spoken(k) for k in initial.missing())[:3] or ["nothing"], _nothing_placed(problem))
+    return _result(problem, initial, index, solve(graph, settings.solver))
 
 
 def _nothing_placed(problem: Problem) -> str:
@@ -104,12 +104,12 @@ def solve_with_amnesia(problem: Problem, settings: TagSlamSettings, progress: Pr
     for done, stamp in enumerate(problem.stamps):
         earlier = problem.stamps[done - 1 : done]
         alone = replace(problem, stamps=(*earlier, stamp), observations=tuple(seen.get(stamp, ())))
-        growth = Growth(alone, settings.grow)
-        growth.poses |= before
-        grow(alone, growth, settings, Silent())
-        graph, index = build_graph(alone, growth.poses, settings)
+        initial = Initialisation(alone, settings.initialisation)
+        initial.poses |= before
+        initialise(alone, initial, settings, Silent())
+        graph, index = build_graph(alone, initial.poses, settings)
         graph.priors += [Prior(index[key], pose, 1e3 * np.eye(6)) for key, pose in before.items()]
-        answers.append(_result(replace(alone, stamps=(stamp,)), growth, index, solve(graph, settings.solver)))
+        answers.append(_result(replace(alone, stamps=(stamp,)), initial, index, solve(graph, settings.solver)))
         now = {key: answers[-1].solution.poses[number] for key, number in index.items()}
         before = {key: pose for key, pose in now.items() if key[0] == "body" and key[2] == stamp}
         progress.step(done + 1, len(problem.stamps), "stamps solved")
@@ -133,35 +133,35 @@ def _joined(answers: list[TagSlamResult]) -> TagSlamResult:
     )
 
 
-def grow(problem: Problem, growth: Growth, settings: TagSlamSettings, progress: Progress) -> None:
+def initialise(problem: Problem, initial: Initialisation, settings: TagSlamSettings, progress: Progress) -> None:
     """Sweep until nothing more can be placed, bolder from stage to stage. What there is is solved in between."""
-    solved_at, fixed_at = 0, growth.fixed()
+    solved_at, fixed_at = 0, initial.fixed()
     for stage in STAGES:
         while not stage.drifted or problem.odometry:
-            placed = growth.sweep(stage)
-            placed += _carry_odometry(problem, growth)
-            placed += _carry_rest(problem, growth) if stage.at_rest and not placed else 0
-            progress.step(growth.wanted - len(growth.missing()), growth.wanted, "poses placed")
-            new = len(growth.poses) - solved_at
-            enough = settings.solve_after if growth.fixed() == fixed_at else 1
-            due = not placed or new >= max(enough, (settings.solve_after_growth - 1) * solved_at)
-            if due and new and growth.missing():
-                solved_at, fixed_at = len(growth.poses), growth.fixed()
-                _settle(problem, growth, settings)
+            placed = initial.sweep(stage)
+            placed += _carry_odometry(problem, initial)
+            placed += _carry_rest(problem, initial) if stage.at_rest and not placed else 0
+            progress.step(initial.wanted - len(initial.missing()), initial.wanted, "poses placed")
+            new = len(initial.poses) - solved_at
+            enough = settings.solve_after if initial.fixed() == fixed_at else 1
+            due = not placed or new >= max(enough, (settings.solve_after_ratio - 1) * solved_at)
+            if due and new and initial.missing():
+                solved_at, fixed_at = len(initial.poses), initial.fixed()
+                _settle(problem, initial, settings)
             elif not placed:
                 break
 
 
-def _settle(problem: Problem, growth: Growth, settings: TagSlamSettings) -> None:
+def _settle(problem: Problem, initial: Initialisation, settings: TagSlamSettings) -> None:
     """Solve what is placed so far, so that drift does not add up."""
-    graph, index = build_graph(problem, growth.poses, settings)
+    graph, index = build_graph(problem, initial.poses, settings)
     try:
-        solution = solve(graph, settings.growing_solver)
+        solution = solve(graph, settings.initial_solver)
     except Undetermined:
         return  # a part that is still loose: the final solution says so if it stays
     for key, number in index.items():
-        if key in growth.poses:
-            growth.poses[key] = solution.poses[number]
+        if key in initial.poses:
+            initial.poses[key] = solution.poses[number]
 
 
 def build_graph(
@@ -265,21 +265,21 @@ def _add_odometry(problem: Problem, graph: Graph, index: Mapping[Key, int]) -> N
             graph.betweens.append(Between(a, b, np.eye(4), np.diag([1 / turn] * 3 + [1 / shift] * 3)))
 
 
-def _carry_odometry(problem: Problem, growth: Growth) -> int:
+def _carry_odometry(problem: Problem, initial: Initialisation) -> int:
     """Place poses next to placed ones along the odometry; how many were."""
     placed = 0
     for body in _with_odometry(problem):
         steps = _odometry_steps(problem, body)
         both_ways = [(a, b, d) for a, b, d, _ in steps] + [(b, a, np.linalg.inv(d)) for a, b, d, _ in reversed(steps)]
         for known, new, delta in both_ways:
-            before, after = growth.poses.get(body_key(body, known)), body_key(body, new)
-            if before is not None and after not in growth.poses:
-                growth.poses[after] = before @ delta
+            before, after = initial.poses.get(body_key(body, known)), body_key(body, new)
+            if before is not None and after not in initial.poses:
+                initial.poses[after] = before @ delta
                 placed += 1
     return placed
 
 
-def _carry_rest(problem: Problem, growth: Growth) -> int:
+def _carry_rest(problem: Problem, initial: Initialisation) -> int:
     """Place a body with fake odometry where it was, or will be, one stamp away; how many poses were placed.
 
     One pose a body in each direction from every gap's end: what comes after may connect by its tags.
@@ -287,11 +287,11 @@ def _carry_rest(problem: Problem, growth: Growth) -> int:
     placed = 0
     for body in _with_fake_odometry(problem):
         keys = [body_key(body, s) for s in problem.stamps]
-        known = [k in growth.poses for k in keys]
+        known = [k in initial.poses for k in keys]
         for i, key in enumerate(keys):
             beside = [j for j in (i - 1, i + 1) if 0 <= j < len(keys) and known[j]]
             if not known[i] and beside:
-                growth.poses[key] = growth.poses[keys[beside[0]]]
+                initial.poses[key] = initial.poses[keys[beside[0]]]
                 placed += 1
     return placed
 
@@ -330,13 +330,13 @@ def _add_measurements(problem: Problem, graph: Graph, index: Mapping[Key, int]) 
 
 
 def _certain(problem: Problem) -> set[Key]:
-    """Moving poses that some unambiguous sighting shows. TagSLAM answers no others, unless odometry carries them."""
+    """Moving poses that some unambiguous detection shows. TagSLAM answers no others, unless odometry carries them."""
     return {
         key for o in problem.observations if unambiguous(problem.config, o) for key in (o.rig_key, o.body_key) if key[2]
     }
 
 
-def _result(problem: Problem, growth: Growth, index: Mapping[Key, int], solution: Solution) -> TagSlamResult:
+def _result(problem: Problem, initial: Initialisation, index: Mapping[Key, int], solution: Solution) -> TagSlamResult:
     poses = {key: solution.poses[number] for key, number in index.items()}
     bodies, static = {}, {}
     certain = _certain(problem)
@@ -357,7 +357,7 @@ def _result(problem: Problem, growth: Growth, index: Mapping[Key, int], solution
         owner={t: b.name for t, b in problem.owner.items()},
         cameras={c.name: poses[camera_key(c.name)] for c in problem.config.cameras if camera_key(c.name) in poses},
         reprojection_px=solution.reprojection_px.ravel(),
-        unplaced=tuple(_spoken(k) for k in growth.missing()),
+        unplaced=tuple(_spoken(k) for k in initial.missing()),
         solution=solution,
         index=index,
     )

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from calibration.tags.detect import TagDetection
-from groundtruth.session_sightings import Sightings, TagSeen
+from groundtruth.session_detections import Detections, TagSeen
 from recordings.geometry import CameraModel, Transform
 from recordings.tracks import RigCalibration, TagPlacement
 
@@ -71,7 +71,7 @@ class TossLab:
     layout: dict[int, np.ndarray]
     truth: dict[int, np.ndarray]
     flies: dict[int, np.ndarray]
-    sightings: Sightings
+    detections: Detections
 
 
 def lab(
@@ -119,7 +119,7 @@ def lab(
                         corners = corners + noise_px * random.normal(size=(4, 2))
                         covariance = np.tile(max(noise_px, 0.05) ** 2 * np.eye(2), (4, 1, 1))
                         seen.append(TagSeen(toss, n, stamp, TagDetection(tag_id, corners, covariance, 80.0, 0)))
-    return TossLab(calibration, looks, layout, truth, flies, Sightings(tuple(seen), stamps, {}, 0))
+    return TossLab(calibration, looks, layout, truth, flies, Detections(tuple(seen), stamps, {}, 0))
 
 
 def visible(model: CameraModel, look: Transform, world_from_tag: np.ndarray, size_m: float) -> np.ndarray | None:

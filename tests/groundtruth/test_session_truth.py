@@ -14,10 +14,10 @@ from groundtruth.cli import main
 from groundtruth.graph import Undetermined
 from groundtruth.interpolate import GRAVITY_WORLD_M_S2, classify, interpolate
 from groundtruth.offset import object_from_tagged_by_mesh, tagged_frame
-from groundtruth.session_sightings import (
+from groundtruth.session_detections import (
     TagSeen,
     assign_roles,
-    grown,
+    enlarged,
     measured_sizes_m,
     shared_times,
     shrink_px,
@@ -37,10 +37,10 @@ NOBODY = frozenset()
 
 def solved(made, calibration=None, sizes=None, within_ns=500_000):
     calibration = calibration or made.calibration
-    sightings, spread = shared_times(made.sightings, within_ns)
-    roles = assign_roles(sightings, calibration, NOBODY, None)
-    answer = solve_session(sightings, roles, sizes or dict.fromkeys(roles.body | roles.still, 0.07), calibration)
-    return answer, judge(answer, sightings, spread, [], calibration)
+    detections, spread = shared_times(made.detections, within_ns)
+    roles = assign_roles(detections, calibration, NOBODY, None)
+    answer = solve_session(detections, roles, sizes or dict.fromkeys(roles.body | roles.still, 0.07), calibration)
+    return answer, judge(answer, detections, spread, [], calibration)
 
 
 def errors(track, truth):
@@ -128,9 +128,9 @@ def test_a_camera_that_misses_frames_costs_nothing(toss_lab):
 
 def test_cameras_that_expose_at_different_times_have_a_pose_each(toss_lab):
     late = toss_lab(tosses=1, late_ns={"mono1": 11_000_000, "mono2": 22_000_000})
-    sightings, spread = shared_times(late.sightings, 500_000)
+    detections, spread = shared_times(late.detections, 500_000)
     assert spread == 0
-    assert len({s.time_ns for s in sightings.seen}) > 40
+    assert len({s.time_ns for s in detections.seen}) > 40
 
 
 def test_stamps_of_one_trigger_that_differ_a_little_are_one_instant_and_it_is_said(toss_lab):
@@ -175,7 +175,7 @@ def test_no_camera_of_a_single_toss_is_called_bumped_where_none_was(toss_lab, se
 
 def test_a_wrong_tag_size_is_found_and_the_right_one_told(made):
     body = frozenset(range(6))
-    measured = measured_sizes_m(triangulated_tags(made.sightings, made.calibration), body)
+    measured = measured_sizes_m(triangulated_tags(made.detections, made.calibration), body)
     with pytest.raises(BadInput, match=r"cameras measure 0\.70. times.*--tag-size 0\.0(70|699)"):
         _sizes(TruthConfig(tag_size_m=0.1), body, body, measured)
     sizes, notes = _sizes(TruthConfig(), body, body, measured)
@@ -184,7 +184,7 @@ def test_a_wrong_tag_size_is_found_and_the_right_one_told(made):
 
 
 def test_tags_that_appear_small_by_a_constant_are_grown_back(made):
-    small = grown(made.sightings, -0.4)
+    small = enlarged(made.detections, -0.4)
     triangulated = triangulated_tags(small, made.calibration)
     assert shrink_px(triangulated, {**dict.fromkeys(range(6), 0.07), 30: 0.08, 31: 0.08}) == pytest.approx(
         0.4, abs=0.05
@@ -192,42 +192,42 @@ def test_tags_that_appear_small_by_a_constant_are_grown_back(made):
 
 
 def test_a_table_tag_that_moves_is_on_two_bodies(made):
-    ids = [s.tag.tag_id for s in made.sightings.seen if s.tag.tag_id < 6]
+    ids = [s.tag.tag_id for s in made.detections.seen if s.tag.tag_id < 6]
     often = max(set(ids), key=ids.count)
     moving = tuple(
         replace(s, tag=replace(s.tag, tag_id=30)) if s.tag.tag_id == often else s
-        for s in made.sightings.seen
+        for s in made.detections.seen
         if s.tag.tag_id != 30
     )
     with pytest.raises(BadInput, match=r"tag 30 moves in the images.*two bodies.*--ignore 30"):
-        assign_roles(replace(made.sightings, seen=moving), made.calibration, NOBODY, None)
+        assign_roles(replace(made.detections, seen=moving), made.calibration, NOBODY, None)
 
 
 def test_an_id_seen_twice_in_one_image_is_on_two_bodies(made):
     with pytest.raises(BadInput, match=r"tag 3 is seen twice.*--ignore 3"):
-        assign_roles(replace(made.sightings, twice={3: 9}), made.calibration, NOBODY, None)
+        assign_roles(replace(made.detections, twice={3: 9}), made.calibration, NOBODY, None)
 
 
 def test_an_id_on_the_table_and_in_the_layout_is_refused(made):
     with pytest.raises(BadInput, match="tag 31 is on two bodies, the table"):
-        assign_roles(made.sightings, made.calibration, NOBODY, {31: np.eye(4), 2: np.eye(4)})
+        assign_roles(made.detections, made.calibration, NOBODY, {31: np.eye(4), 2: np.eye(4)})
 
 
 def test_tags_of_which_none_moves_are_no_tossed_object(made):
-    still = tuple(s for s in made.sightings.seen if s.tag.tag_id >= 30)
+    still = tuple(s for s in made.detections.seen if s.tag.tag_id >= 30)
     with pytest.raises(BadInput, match="no tag moves"):
-        assign_roles(replace(made.sightings, seen=still), made.calibration, NOBODY, None)
+        assign_roles(replace(made.detections, seen=still), made.calibration, NOBODY, None)
 
 
 def test_a_tag_seen_once_is_not_taken_for_the_objects(made):
     corners, covariance = np.array([[5.0, 5], [6, 5], [6, 6], [5, 6]]), np.tile(np.eye(2), (4, 1, 1))
-    odd = TagSeen(0, "mono0", made.sightings.seen[0].time_ns, TagDetection(77, corners, covariance, 9.0, 0))
-    roles = assign_roles(made.sightings, made.calibration, NOBODY, None)
+    odd = TagSeen(0, "mono0", made.detections.seen[0].time_ns, TagDetection(77, corners, covariance, 9.0, 0))
+    roles = assign_roles(made.detections, made.calibration, NOBODY, None)
     assert 77 not in roles.body
     assert (
         77
         not in assign_roles(
-            replace(made.sightings, seen=(*made.sightings.seen, odd)), made.calibration, NOBODY, None
+            replace(made.detections, seen=(*made.detections.seen, odd)), made.calibration, NOBODY, None
         ).body
     )
 

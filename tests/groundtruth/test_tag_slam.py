@@ -15,7 +15,7 @@ from groundtruth import se3
 from groundtruth.factors import CORNERS, Between, Coordinate, Distance, Prior, Projection
 from groundtruth.graph import Graph, SolverConfig, Undetermined, covariances, solve
 from groundtruth.tagslam.config import BodyEntry, CameraEntry, NoisyPose, TagEntry, TagSlamConfig, read_config
-from groundtruth.tagslam.detections import Recording, Sighting, read_recording
+from groundtruth.tagslam.detections import DetectedTag, Recording, read_recording
 from groundtruth.tagslam.problem import planar_poses
 from groundtruth.tagslam.solve import run_tag_slam
 from recordings.errors import BadInput
@@ -180,7 +180,7 @@ def wall_with_two_tags(minimum_area: float = 0.0, second_size_m: float = 0.3):
         for tag_id, size_m, world_from_tag in ((1, 0.3, FACING), (2, second_size_m, second)):
             pixels = view(np.linalg.inv(place) @ world_from_tag, size_m)
             if CAMERA.sees(pixels).all():
-                tags.append(Sighting(tag_id, 0, pixels + 0.1 * random.normal(size=(4, 2))))
+                tags.append(DetectedTag(tag_id, 0, pixels + 0.1 * random.normal(size=(4, 2))))
         frames[k * 100_000_000] = tuple(tags)
         if before is not None:
             step = np.linalg.inv(before) @ place

@@ -26,7 +26,7 @@ STILL_PX = 1.5
 MOVES_PX = 25.0
 """The object moves farther than this in a toss."""
 TWICE_PX = 12.0
-"""Two sightings of one id in one image, farther apart than this, are two tags."""
+"""Two detections of one id in one image, farther apart than this, are two tags."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +40,7 @@ class TagSeen:
 
 
 @dataclass(frozen=True, eq=False)
-class Sightings:
+class Detections:
     """Everything seen. `frames[toss][camera]`: times of all images, with or without tags. `twice`: ids seen twice in
     one image, and in how many. `lost_images`: on which the detector died."""
 
@@ -61,7 +61,7 @@ def find_tags(
     family: str,
     offset_ns: int,
     progress: Progress,
-) -> Sightings:
+) -> Detections:
     """Detect tags in all mono images, cached beside the session. `offset_ns` is added to their stamps.
 
     Raises BadInput where there is no image or no tag.
@@ -90,7 +90,7 @@ def find_tags(
         for tag in next(every)
     ]
     kept, twice = _single(seen)
-    return Sightings(tuple(kept), frames, twice, len(lists.lost))
+    return Detections(tuple(kept), frames, twice, len(lists.lost))
 
 
 def _images(session: Session, counts: Sequence[tuple[str | int, str, int]]) -> Iterator[UInt8[Array, "h w"]]:
@@ -144,7 +144,7 @@ class Roles:
 
 
 def assign_roles(
-    sightings: Sightings, calibration: RigCalibration, ignored: frozenset[int], layout: Mapping[int, Array] | None
+    detections: Detections, calibration: RigCalibration, ignored: frozenset[int], layout: Mapping[int, Array] | None
 ) -> Roles:
     """Table tags are the calibration's; of the others those that move in the images are the object's.
 
@@ -157,33 +157,33 @@ def assign_roles(
             f"tag {both[0]} is on two bodies, the table (calibration.json) and the object (the given layout); "
             "wanted every id once: print another one, or correct the files"
         )
-    often = {i: n for i, n in sightings.twice.items() if n > 2}
+    often = {i: n for i, n in detections.twice.items() if n > 2}
     if often:
         raise BadInput(
             f"tag {min(often)} is seen twice in one image, {often[min(often)]} times: it is on two bodies, or "
             f"printed twice; wanted every id once. Cover one of them, or leave it out: `--ignore {min(often)}`"
         )
-    moving, staying = _moved(sightings)
+    moving, staying = _moved(detections)
     suspicious = sorted(moving & known - ignored)
     if suspicious:
         raise BadInput(
             f"tag {suspicious[0]} moves in the images, yet calibration.json has it on the table: it is on two bodies, "
             f"or the table's list is wrong; leave it out with `--ignore {suspicious[0]}`, or correct calibration.json"
         )
-    ids = {s.tag.tag_id for s in sightings.seen} - ignored - known
+    ids = {s.tag.tag_id for s in detections.seen} - ignored - known
     body = frozenset(layout) & ids if layout is not None else frozenset(ids & moving)
     if not body:
         raise BadInput(
-            f"no tag moves in these tosses: of {sorted({s.tag.tag_id for s in sightings.seen})} none is on a tossed "
+            f"no tag moves in these tosses: of {sorted({s.tag.tag_id for s in detections.seen})} none is on a tossed "
             "object; wanted tags on it, in view of the mono cameras while it flies"
         )
     return Roles(known - ignored, frozenset(ids & staying - body), body)
 
 
-def _moved(sightings: Sightings) -> tuple[frozenset[int], frozenset[int]]:
+def _moved(detections: Detections) -> tuple[frozenset[int], frozenset[int]]:
     """Ids whose centre wanders over some toss in some camera, and ids seen often that stay in all."""
     centers: dict[tuple[int, int, str], list[Float[Array, "2"]]] = defaultdict(list)
-    for s in sightings.seen:
+    for s in detections.seen:
         centers[(s.tag.tag_id, s.toss, s.camera)].append(s.tag.corners_px.mean(axis=0))
     reach: dict[int, float] = defaultdict(float)
     most: dict[int, int] = defaultdict(int)
@@ -195,12 +195,12 @@ def _moved(sightings: Sightings) -> tuple[frozenset[int], frozenset[int]]:
     return moving, frozenset(i for i, r in reach.items() if r < STILL_PX and most[i] >= 5)
 
 
-def shared_times(sightings: Sightings, within_ns: int) -> tuple[Sightings, int]:
+def shared_times(detections: Detections, within_ns: int) -> tuple[Detections, int]:
     """Times of different cameras that are nearer than `within_ns` made equal (to the earliest), and the largest spread
     (ns) of those that were: triggered cameras share an instant, others keep their own."""
     moved: dict[tuple[int, int], int] = {}
     spread = 0
-    for toss, cameras in sightings.frames.items():
+    for toss, cameras in detections.frames.items():
         times = np.unique(np.concatenate(list(cameras.values()))) if cameras else np.zeros(0, np.int64)
         start = None
         for t in times.tolist():
@@ -208,14 +208,14 @@ def shared_times(sightings: Sightings, within_ns: int) -> tuple[Sightings, int]:
                 start = t
             spread = max(spread, t - start)
             moved[(toss, t)] = start
-    seen = tuple(replace(s, time_ns=moved[(s.toss, s.time_ns)]) for s in sightings.seen)
+    seen = tuple(replace(s, time_ns=moved[(s.toss, s.time_ns)]) for s in detections.seen)
     frames = {
         toss: {
             name: np.array([moved[(toss, int(t))] for t in times], dtype=np.int64) for name, times in cameras.items()
         }
-        for toss, cameras in sightings.frames.items()
+        for toss, cameras in detections.frames.items()
     }
-    return replace(sightings, seen=seen, frames=frames), spread
+    return replace(detections, seen=seen, frames=frames), spread
 
 
 @dataclass(frozen=True, eq=False)
@@ -227,10 +227,10 @@ class Measured:
     edge_px: float
 
 
-def triangulated_tags(sightings: Sightings, calibration: RigCalibration) -> list[Measured]:
+def triangulated_tags(detections: Detections, calibration: RigCalibration) -> list[Measured]:
     """Every tag that two or more cameras of known place saw at an instant."""
     groups: dict[tuple[int, int, int], list[TagSeen]] = defaultdict(list)
-    for s in sightings.seen:
+    for s in detections.seen:
         groups[(s.toss, s.time_ns, s.tag.tag_id)].append(s)
     found = []
     for (*_, tag_id), group in groups.items():
@@ -262,7 +262,7 @@ def shrink_px(measured: Sequence[Measured], sizes_m: Mapping[int, float], least:
     return value if abs(value) < 1.0 else 0.0
 
 
-def grown(sightings: Sightings, by_px: float) -> Sightings:
+def enlarged(detections: Detections, by_px: float) -> Detections:
     """All tags' edges lengthened by this many pixels about their middles."""
 
     def larger(s: TagSeen) -> TagSeen:
@@ -270,7 +270,7 @@ def grown(sightings: Sightings, by_px: float) -> Sightings:
         middle = corners.mean(axis=0)
         return replace(s, tag=replace(s.tag, corners_px=middle + (corners - middle) * (1 + by_px / _edge(corners))))
 
-    return replace(sightings, seen=tuple(larger(s) for s in sightings.seen))
+    return replace(detections, seen=tuple(larger(s) for s in detections.seen))
 
 
 def _world_rays(calibration: RigCalibration, s: TagSeen) -> tuple[Float[Array, "3"], Float[Array, "4 3"]] | None:

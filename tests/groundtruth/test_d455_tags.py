@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from calibration.cli import main as calibrate_main
 from calibration.tags.detect import TagDetection
 from groundtruth.cli import main
-from groundtruth.d455_tags import WitnessConfig, by_sightings, color_tags
+from groundtruth.d455_tags import D455RefinementConfig, by_detections, color_tags
 from groundtruth.toss_truth import TossTruth, TrackedLimits, statuses
 from recordings.cli_session import main as session_main
 from recordings.geometry import CameraModel
@@ -79,20 +79,20 @@ def errors(found, true):
 
 def test_guesses_are_put_right_and_sure_poses_stay(scene):
     truth, true, seen, known = scene
-    answer = by_sightings(CAMERA, known, seen, {0: truth}, LIMITS, WitnessConfig())
+    answer = by_detections(CAMERA, known, seen, {0: truth}, LIMITS, D455RefinementConfig())
     found = answer.tosses[0]
     np.testing.assert_array_equal(found.world_from_tagged[~truth.open], truth.world_from_tagged[~truth.open])
     gap_m, turn_rad = errors(found.world_from_tagged[truth.open], true[truth.open])
     before_m, before_rad = errors(truth.world_from_tagged[truth.open], true[truth.open])
     assert np.sqrt((gap_m**2).mean()) < 0.4 * np.sqrt((before_m**2).mean())
     assert np.sqrt((turn_rad**2).mean()) < 0.3 * np.sqrt((before_rad**2).mean())
-    assert found.witnessed.tolist() == truth.open.tolist()
+    assert found.refined.tolist() == truth.open.tolist()
     assert answer.off_m == pytest.approx(7e-4, abs=6e-4)
 
 
 def test_what_it_says_of_its_error_is_about_its_error(scene):
     truth, true, seen, known = scene
-    found = by_sightings(CAMERA, known, seen, {0: truth}, LIMITS, WitnessConfig()).tosses[0]
+    found = by_detections(CAMERA, known, seen, {0: truth}, LIMITS, D455RefinementConfig()).tosses[0]
     gap_m, turn_rad = errors(found.world_from_tagged[truth.open], true[truth.open])
     said = np.sqrt(np.einsum("nii->ni", found.covariance[truth.open]))
     assert 0.4 < np.sqrt((gap_m**2).mean() / (said[:, 3:] ** 2).sum(axis=1).mean()) < 1.6
@@ -102,14 +102,14 @@ def test_what_it_says_of_its_error_is_about_its_error(scene):
 def test_corners_of_another_scene_change_nothing(scene):
     truth, _, seen, known = scene
     wrong = [replace(s, pixels=s.pixels + [40.0, -25.0]) if truth.open[s.frame] else s for s in seen]
-    found = by_sightings(CAMERA, known, wrong, {0: truth}, LIMITS, WitnessConfig()).tosses[0]
+    found = by_detections(CAMERA, known, wrong, {0: truth}, LIMITS, D455RefinementConfig()).tosses[0]
     np.testing.assert_array_equal(found.world_from_tagged, truth.world_from_tagged)
-    assert not found.witnessed.any()
+    assert not found.refined.any()
 
 
 def test_a_camera_that_hardly_sees_the_sure_poses_says_nothing(scene):
     truth, _, seen, known = scene
-    assert by_sightings(CAMERA, known, seen[:3], {0: truth}, LIMITS, WitnessConfig()) is None
+    assert by_detections(CAMERA, known, seen[:3], {0: truth}, LIMITS, D455RefinementConfig()) is None
 
 
 @pytest.mark.slow
