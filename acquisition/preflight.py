@@ -108,10 +108,10 @@ def _watch(recorder: Recorder, seconds: float) -> dict[str, list[float]]:
 def devices(recorder: Recorder) -> Iterator[Row]:
     """Every device of the rig, as it names itself."""
     for entry in recorder.rig.devices:
-        told = recorder.devices[entry.name].describe()
-        found = " ".join(str(told.get(k, "")) for k in ("model", "serial", "firmware")).strip()
+        described = recorder.devices[entry.name].describe()
+        found = " ".join(str(described.get(k, "")) for k in ("model", "serial", "firmware")).strip()
         yield Row("device", entry.name, "ok", found)
-        for text in told.get("warnings", []):
+        for text in described.get("warnings", []):
             yield Row("device", entry.name, "warning", str(text))
 
 

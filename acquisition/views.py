@@ -233,10 +233,10 @@ def _write(
         if image.pixels.ndim == 3:
             data = cv2.imencode(".png", cv2.cvtColor(image.pixels, cv2.COLOR_RGB2BGR))[1].tobytes()
             writer.color(EncodedImage(name, number, time_ns, time_ns, "png", width, height, data))
-            looks = list(recorder.thumbnails)[-1:]
+            thumbnails = list(recorder.thumbnails)[-1:]
             depth = recorder.latest.get(f"/{name}/depth")
-            if depth is not None and looks:
-                writer.depth(DepthImage(name, number, time_ns, time_ns, looks[0].unit_m, depth.pixels))
+            if depth is not None and thumbnails:
+                writer.depth(DepthImage(name, number, time_ns, time_ns, thumbnails[0].unit_m, depth.pixels))
         else:
             data = cv2.imencode(".png", image.pixels)[1].tobytes()
             writer.mono(EncodedImage(name, number, time_ns, time_ns, "png", width, height, data))

@@ -172,17 +172,17 @@ def _size_by_depth(session: Session, views: BoardViews, placed: PlacedCameras) -
         depths = toss.depth()
         ratios = []
         for view, pose in placed.reference_from_body.items():
-            look = views.board[COLOR][view]
-            if not len(look) or not len(depths):
+            board_view = views.board[COLOR][view]
+            if not len(board_view) or not len(depths):
                 continue
             k = depths.nearest(int(views.times_ns[view]))
             image = depths[k]
             if image.raw.shape != (model.height, model.width):
                 return []
-            u, v = np.rint(look.pixels).astype(int).T
+            u, v = np.rint(board_view.pixels).astype(int).T
             inside = (u >= 0) & (v >= 0) & (u < model.width) & (v < model.height)
             measured = image.raw[v[inside], u[inside]] * image.unit_m
-            predicted = (look.points_m @ pose[:3, :3].T + pose[:3, 3])[inside, 2]
+            predicted = (board_view.points_m @ pose[:3, :3].T + pose[:3, 3])[inside, 2]
             ratios += (measured / predicted)[measured > 0].tolist()
     if len(ratios) < 20:
         return []
@@ -202,9 +202,9 @@ def hand_eye(path: Path, args: argparse.Namespace, progress: Progress) -> Done:
         if args.camera not in views.board:
             raise BadInput(f"no views of {args.camera}; {VIEWS_FILE} has {', '.join(sorted(views.board))}")
         base_from_tool, kept = _robot_poses(session, views)
-        looks = [views.board[args.camera][k] for k in kept]
+        board_views = [views.board[args.camera][k] for k in kept]
         model = session.calibration.camera(args.camera)
-        solved = calibrate_hand_eye(model, looks, base_from_tool, args.mounting)
+        solved = calibrate_hand_eye(model, board_views, base_from_tool, args.mounting)
         picture = residual_picture(
             store.work_folder(session) / "hand_eye.png",
             f"{session.name}: {solved.report.kind}",
@@ -231,7 +231,7 @@ def _robot_poses(session: Session, views: BoardViews) -> tuple[Float[Array, "n 4
             f"{session.path / VIEWS_FILE} has no joint states; record views with the arm: "
             "`toss-record --calibration hand-eye`"
         )
-    course = ArmPath(panda(), states)
-    kept = [k for k, when in enumerate(views.times_ns.tolist()) if course.covers(when)]
-    poses = [course.links(int(views.times_ns[k]))[TOOL].matrix for k in kept]
+    arm_path = ArmPath(panda(), states)
+    kept = [k for k, when in enumerate(views.times_ns.tolist()) if arm_path.covers(when)]
+    poses = [arm_path.links(int(views.times_ns[k]))[TOOL].matrix for k in kept]
     return np.array(poses).reshape(-1, 4, 4), kept

@@ -54,17 +54,17 @@ INDEPENDENT_CORNERS = 3
 def table(path: Path, args: argparse.Namespace, progress: Progress) -> Done:
     with Session.open(path) as session:
         calibration = session.calibration
-        looks = _table_looks(session, progress)
-        models = {n: calibration.cameras[n] for n in looks}
-        places = camera_from_rig(calibration, list(looks), COLOR)
+        table_views = _table_views(session, progress)
+        models = {n: calibration.cameras[n] for n in table_views}
+        places = camera_from_rig(calibration, list(table_views), COLOR)
         target = table_target(calibration)
         tags_px, hold_out, tags, rig_from_world = None, {}, None, None
-        if target is not None and any(len(v) >= 4 for v in looks.values()):
-            solved = place_world(models, places, looks)
+        if target is not None and any(len(v) >= 4 for v in table_views.values()):
+            solved = place_world(models, places, table_views)
             tags_px, rig_from_world = solved.rms_px, solved.scene.rig_from_body[0]
             covariance = solved.covariance[solved.blocks["view", 0], solved.blocks["view", 0]]
-            tags = _corners_in_rig(target, looks, rig_from_world, covariance)
-            hold_out = _without_one_camera(models, places, looks, rig_from_world)
+            tags = _corners_in_rig(target, table_views, rig_from_world, covariance)
+            hold_out = _without_one_camera(models, places, table_views, rig_from_world)
         elif target is not None:
             why = explain_absence(grey_images(session.toss(session.tosses[0]), COLOR)[1], calibration.tag_family)
             progress.value(f"no table tags found: {why}", 0.0, at=0)
@@ -115,12 +115,12 @@ def _plane_entry(plane: Plane, tags: object, depth: object) -> dict[str, object]
     }
 
 
-def _table_looks(session: Session, progress: Progress) -> dict[str, TargetView]:
+def _table_views(session: Session, progress: Progress) -> dict[str, TargetView]:
     """The table's tags in every camera, over images of several tosses."""
     target = table_target(session.calibration)
-    looks: dict[str, TargetView] = {}
+    table_views: dict[str, TargetView] = {}
     if target is None:
-        return looks
+        return table_views
     with_mono = [n for n in session.tosses if mono_cameras(session, session.toss(n).cameras())]
     for camera in sorted({c for n in session.tosses[:1] + tuple(with_mono[:1]) for c in session.toss(n).cameras()}):
         if camera not in session.calibration.cameras:
@@ -131,16 +131,16 @@ def _table_looks(session: Session, progress: Progress) -> dict[str, TargetView]:
         found = detect_tags(some, target.family, store.work_folder(session), progress, response=response_of(camera))
         view = still_view([tag_view(target, tags) for tags in found])
         if view is not None:
-            looks[camera] = view
-    return looks
+            table_views[camera] = view
+    return table_views
 
 
 def _corners_in_rig(
-    target: Tags, looks: Mapping[str, TargetView], rig_from_world: Array, covariance: Float[Array, "6 6"]
+    target: Tags, table_views: Mapping[str, TargetView], rig_from_world: Array, covariance: Float[Array, "6 6"]
 ) -> tuple[Float[Array, "n 3"], Float[Array, "n 3 3"]]:
     """Corners of the tags that were seen, in the rig, with covariances. All share one pose's error, so each is given
     the weight of a few independent points together."""
-    seen = sorted({i // 4 for view in looks.values() for i in view.ids.tolist()})
+    seen = sorted({i // 4 for view in table_views.values() for i in view.ids.tolist()})
     corners = np.concatenate([target.corners_m(i) for i in seen if i in target.board_from_tag])
     points = corners @ rig_from_world[:3, :3].T + rig_from_world[:3, 3]
     cross = np.array([[[0, z, -y], [-z, 0, x], [y, -x, 0]] for x, y, z in points])
@@ -150,12 +150,12 @@ def _corners_in_rig(
 
 
 def _without_one_camera(
-    models: Mapping, places: Mapping, looks: Mapping[str, TargetView], full: Float[Array, "4 4"]
+    models: Mapping, places: Mapping, table_views: Mapping[str, TargetView], full: Float[Array, "4 4"]
 ) -> dict[str, float]:
     """How far the table rises or sinks under the world's origin when a camera is left out."""
     changes = []
-    for out in looks:
-        rest = {n: v for n, v in looks.items() if n != out}
+    for out in table_views:
+        rest = {n: v for n, v in table_views.items() if n != out}
         if sum(len(v) for n, v in rest.items() if n in places) < 8:
             continue
         other = place_world(models, places, rest).scene.rig_from_body[0]
@@ -216,12 +216,12 @@ def _gravity(
         if not mono_cameras(session, session.toss(number).cameras()):
             continue
         try:
-            course = solve_toss(session, number, args, progress).centered()
+            trajectory = solve_toss(session, number, args, progress).centered()
         except BadInput:
             continue
         release_ns = session.toss(number).window().release_time_ns
-        flight = find_flight(course, None if release_ns is None else release_ns / 1e9)
+        flight = find_flight(trajectory, None if release_ns is None else release_ns / 1e9)
         if flight is not None:
-            in_rig = gravity_from_flight(course, flight)
+            in_rig = gravity_from_flight(trajectory, flight)
             found.append(replace(in_rig, down=world_from_rig.vectors(in_rig.down[None])[0]))
     return found

@@ -1,4 +1,4 @@
-"""What `toss-calibrate time | cameras --from object` do: they look at the tosses themselves."""
+"""What `toss-calibrate time | cameras --from object` do: they work on the tosses themselves."""
 
 from __future__ import annotations
 
@@ -118,15 +118,15 @@ def _mono_offset(session: Session, solved: SolvedToss) -> TimeOffset:
 
 
 def _arm_offset(session: Session, toss: Toss, solved: SolvedToss, mono: TimeOffset) -> TimeOffset | None:
-    """The arm's course against the object's while it is held; None where the toss has no arm or its base is unknown."""
+    """The arm's trajectory against that of the held object; None without an arm, or where its base is unknown."""
     states = toss.arm_states()
     base = session.calibration.find("base", COLOR)
     if states is None or base is None:
         return None
-    course = ArmPath(panda(), states)
+    arm_path = ArmPath(panda(), states)
     release = toss.window().release_time_ns or _fingers_open_ns(states.time_ns, states.finger_width_m)
     times = np.arange(states.time_ns[0], min(states.time_ns[-1], release), ARM_STEP_NS)
-    tool = np.array([course.links(int(t))[TOOL].matrix for t in times])
+    tool = np.array([arm_path.links(int(t))[TOOL].matrix for t in times])
     held = solved.course.time_s + mono.offset_s < release / 1e9
     if held.sum() < 4:
         raise BadInput(f"the object is seen in {int(held.sum())} images before the release; wanted 4")
@@ -195,10 +195,10 @@ def _color_place(
         return None
     body = Tags(session.calibration.tag_family, tag_sizes(args, tags.tags, {}), solved.body_from_tag)
     offset_s = clock_offset_ns(session.calibration.residuals, "mono") / 1e9
-    course = Path3.of_poses(times_ns[solved.instants] / 1e9 + offset_s, solved.rig_from_body)
+    trajectory = Path3.of_poses(times_ns[solved.instants] / 1e9 + offset_s, solved.rig_from_body)
     stamps = tags.times_ns[COLOR] / 1e9
     frames = [(float(t), tag_view(body, seen)) for t, seen in zip(stamps, tags.tags[COLOR])]
-    place = place_by_motion(course, session.calibration.camera(COLOR), frames)
+    place = place_by_motion(trajectory, session.calibration.camera(COLOR), frames)
     return None if place is None else Transform.from_matrix(COLOR, solved.cameras[0], place)
 
 

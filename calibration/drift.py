@@ -68,14 +68,15 @@ def drift_findings(
 def bumps(views: Mapping[str, Sequence[TargetView]]) -> list[Finding]:
     """Cameras that moved between two views, by tags that stand still in all of them."""
     findings = []
-    for camera, looks in views.items():
-        place = _places(looks)
+    for camera, board_views in views.items():
+        place = _places(board_views)
         known = np.flatnonzero(np.isfinite(place).all(axis=1))
         if len(known) < 3:
             continue
-        course = place[known]
+        path_px = place[known]
         jumps = [
-            np.linalg.norm(np.median(course[:k], axis=0) - np.median(course[k:], axis=0)) for k in range(1, len(known))
+            np.linalg.norm(np.median(path_px[:k], axis=0) - np.median(path_px[k:], axis=0))
+            for k in range(1, len(known))
         ]
         worst = int(np.argmax(jumps))
         if jumps[worst] > MOVED_PX:
@@ -86,14 +87,14 @@ def bumps(views: Mapping[str, Sequence[TargetView]]) -> list[Finding]:
     return findings
 
 
-def _places(looks: Sequence[TargetView]) -> Float[Array, "v 2"]:
+def _places(board_views: Sequence[TargetView]) -> Float[Array, "v 2"]:
     """Mean displacement of each view's corners from their medians over all views; NaN where a view shows none."""
-    ids = np.unique(np.concatenate([v.ids for v in looks])) if looks else np.zeros(0, dtype=np.int64)
+    ids = np.unique(np.concatenate([v.ids for v in board_views])) if board_views else np.zeros(0, dtype=np.int64)
     middle = {
-        i: np.median([v.pixels[v.ids == i][0] for v in looks if (v.ids == i).any()], axis=0) for i in ids.tolist()
+        i: np.median([v.pixels[v.ids == i][0] for v in board_views if (v.ids == i).any()], axis=0) for i in ids.tolist()
     }
-    out = np.full((len(looks), 2), np.nan)
-    for k, view in enumerate(looks):
+    out = np.full((len(board_views), 2), np.nan)
+    for k, view in enumerate(board_views):
         if len(view) >= LEAST_CORNERS:
             out[k] = np.median([view.pixels[n] - middle[i] for n, i in enumerate(view.ids.tolist())], axis=0)
     return out

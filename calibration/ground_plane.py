@@ -242,7 +242,7 @@ def _ransac(points: Float[Array, "n 3"], rng: np.random.Generator) -> Plane:
 
 @dataclass(frozen=True)
 class Gravity:
-    """Downward direction in the course's frame, its deviation, and the size of the acceleration."""
+    """Downward direction in the trajectory's frame, its deviation, and the size of the acceleration."""
 
     down: Float[Array, "3"]
     std_deg: float
@@ -250,29 +250,29 @@ class Gravity:
     frames: int
 
 
-def gravity_from_flight(course: Path3, flight: slice) -> Gravity:
+def gravity_from_flight(trajectory: Path3, flight: slice) -> Gravity:
     """From positions in free flight, p + R c = a + v t + g t^2 / 2: with rotations the centre of mass c of the body is
     found too, within a centimetre or so of the tracked point. Raises BadInput for too short a flight."""
-    found, left = _ballistic(course, flight)
+    found, left = _ballistic(trajectory, flight)
     acceleration, size = found[6:9], float(np.linalg.norm(found[6:9]))
     spare = max(1, left.size - 9)
-    A = _ballistic_matrix(course, flight)
+    A = _ballistic_matrix(trajectory, flight)
     covariance = float((left**2).sum()) / spare * np.linalg.pinv(A.T @ A)[6:9, 6:9]
     across = np.eye(3) - np.outer(acceleration, acceleration) / size**2
     std = float(np.sqrt(np.trace(across @ covariance @ across))) / size
     return Gravity(acceleration / size, float(np.degrees(std)), size, len(left))
 
 
-def find_flight(course: Path3, release_s: float | None = None) -> slice | None:
+def find_flight(trajectory: Path3, release_s: float | None = None) -> slice | None:
     """The longest stretch (after the release, where that is known) that a parabola explains to a millimetre with about
     the right acceleration; None without one."""
-    count, best = len(course.time_s), None
-    first = 0 if release_s is None else int(np.searchsorted(course.time_s, release_s))
+    count, best = len(trajectory.time_s), None
+    first = 0 if release_s is None else int(np.searchsorted(trajectory.time_s, release_s))
     for start in range(first, count - LEAST_FLIGHT):
         for stop in range(count, start + LEAST_FLIGHT, -1):
             if best is not None and stop - start <= best.stop - best.start:
                 break
-            found, left = _ballistic(course, slice(start, stop))
+            found, left = _ballistic(trajectory, slice(start, stop))
             right_size = 0.8 < np.linalg.norm(found[6:9]) / GRAVITY_M_S2 < 1.2
             if right_size and np.sqrt((left**2).mean()) < FLIGHT_RMS_M:
                 best = slice(start, stop)
@@ -280,22 +280,22 @@ def find_flight(course: Path3, release_s: float | None = None) -> slice | None:
     return best
 
 
-def _ballistic(course: Path3, flight: slice) -> tuple[Array, Float[Array, "n 3"]]:
-    count = len(course.time_s[flight])
+def _ballistic(trajectory: Path3, flight: slice) -> tuple[Array, Float[Array, "n 3"]]:
+    count = len(trajectory.time_s[flight])
     if count < LEAST_FLIGHT:
         raise BadInput(f"{count} frames of free flight; wanted {LEAST_FLIGHT} or more")
-    A, places = _ballistic_matrix(course, flight), course.position_m[flight].ravel()
+    A, places = _ballistic_matrix(trajectory, flight), trajectory.position_m[flight].ravel()
     places = np.concatenate([places, np.zeros(len(A) - len(places))])
     found = np.linalg.lstsq(A, places, rcond=None)[0]
     return found, (places - A @ found)[: 3 * count].reshape(-1, 3)
 
 
-def _ballistic_matrix(course: Path3, flight: slice) -> Float[Array, "m k"]:
+def _ballistic_matrix(trajectory: Path3, flight: slice) -> Float[Array, "m k"]:
     """Columns a, v, g, and c where rotations are known, with rows that hold c near the tracked point."""
-    t = course.time_s[flight] - course.time_s[flight].mean()
+    t = trajectory.time_s[flight] - trajectory.time_s[flight].mean()
     parts = [np.kron(factor[:, None], np.eye(3)) for factor in (np.ones_like(t), t, 0.5 * t * t)]
-    if course.rotation is not None:
-        parts.append(-course.rotation[flight].reshape(-1, 3))
+    if trajectory.rotation is not None:
+        parts.append(-trajectory.rotation[flight].reshape(-1, 3))
         near = np.hstack([np.zeros((3, 9)), FLIGHT_RMS_M / CENTER_SIGMA_M * np.eye(3)])
         return np.vstack([np.hstack(parts), near])
     return np.hstack(parts)

@@ -85,9 +85,9 @@ def calibrate_hand_eye(
     moved = base_from_tool[used] if mounting == "eye-to-hand" else inverse_poses(base_from_tool[used])
     missing = missing_motion(moved)
     start = best_start(camera_from_board, moved)
-    looks = _Looks(model, [views[k] for k in used], moved, mounting)
-    solved = _refine(looks, start, arm)
-    hold_out = _hold_out(looks, (solved.camera_from_mount, solved.held_from_board), arm)
+    observations = _Observations(model, [views[k] for k in used], moved, mounting)
+    solved = _refine(observations, start, arm)
+    hold_out = _hold_out(observations, (solved.camera_from_mount, solved.held_from_board), arm)
     findings = [Finding("refused", text) for text in missing] + _judge(solved, hold_out, len(used))
     mm, deg = _spread(solved.covariance)
     report = Report(
@@ -244,7 +244,7 @@ class _Refined:
 
 
 @dataclass(frozen=True, eq=False)
-class _Looks:
+class _Observations:
     """The board's views and the robot's motion, one each per pose."""
 
     model: CameraModel
@@ -252,8 +252,8 @@ class _Looks:
     moved: Float[Array, "n 4 4"]
     mounting: Mounting
 
-    def some(self, keep: Array) -> _Looks:
-        return _Looks(self.model, [v for v, k in zip(self.views, keep) if k], self.moved[keep], self.mounting)
+    def some(self, keep: Array) -> _Observations:
+        return _Observations(self.model, [v for v, k in zip(self.views, keep) if k], self.moved[keep], self.mounting)
 
     def corrected(self, off: Float[Array, "n 6"]) -> Float[Array, "n 4 4"]:
         """The arm errs in its tool's frame, which is on the right of base_from_tool and on the left of its inverse."""
@@ -261,24 +261,24 @@ class _Looks:
         return self.moved @ small if self.mounting == "eye-to-hand" else small @ self.moved
 
 
-def _refine(looks: _Looks, start: tuple[Array, Array], arm: ArmAccuracy) -> _Refined:
+def _refine(observations: _Observations, start: tuple[Array, Array], arm: ArmAccuracy) -> _Refined:
     """Joint least squares; then again with the arm's accuracy that the first round found (between a third and three
     times of what was assumed)."""
-    first = _solve(looks, start, arm)
-    spare = np.sqrt(max(0.2, 1.0 - 2.0 / len(looks.views)))
+    first = _solve(observations, start, arm)
+    spare = np.sqrt(max(0.2, 1.0 - 2.0 / len(observations.views)))
     turn = np.clip(first.robot_deg / np.sqrt(3) / spare, arm.turn_deg / 3, 3 * arm.turn_deg)
     shift = np.clip(1e-3 * first.robot_mm / np.sqrt(3) / spare, arm.shift_m / 3, 3 * arm.shift_m)
     found = (first.camera_from_mount, first.held_from_board)
-    return _solve(looks, found, ArmAccuracy(float(turn), float(shift)))
+    return _solve(observations, found, ArmAccuracy(float(turn), float(shift)))
 
 
-def _solve(looks: _Looks, start: tuple[Array, Array], arm: ArmAccuracy) -> _Refined:
+def _solve(observations: _Observations, start: tuple[Array, Array], arm: ArmAccuracy) -> _Refined:
     """Over X, T and a small correction of every robot pose, weighted by the pixels' and the arm's accuracy."""
-    count = len(looks.views)
-    owner = np.repeat(np.arange(count), [len(v) for v in looks.views])
-    points = np.concatenate([v.points_m for v in looks.views])
-    pixels = np.concatenate([v.pixels for v in looks.views])
-    white = whitening(np.concatenate([v.covariance_px2 for v in looks.views]))
+    count = len(observations.views)
+    owner = np.repeat(np.arange(count), [len(v) for v in observations.views])
+    points = np.concatenate([v.points_m for v in observations.views])
+    pixels = np.concatenate([v.pixels for v in observations.views])
+    white = whitening(np.concatenate([v.covariance_px2 for v in observations.views]))
     sigma = np.array([np.radians(arm.turn_deg)] * 3 + [arm.shift_m] * 3)
 
     def split(numbers: Array) -> tuple[Array, Array, Array]:
@@ -287,8 +287,8 @@ def _solve(looks: _Looks, start: tuple[Array, Array], arm: ArmAccuracy) -> _Refi
 
     def gaps(numbers: Array) -> Array:
         X, T, off = split(numbers)
-        chain = (X[None] @ looks.corrected(off) @ T[None])[owner]
-        seen = looks.model.project(np.einsum("nij,nj->ni", chain[:, :3, :3], points) + chain[:, :3, 3])
+        chain = (X[None] @ observations.corrected(off) @ T[None])[owner]
+        seen = observations.model.project(np.einsum("nij,nj->ni", chain[:, :3, :3], points) + chain[:, :3, 3])
         return np.where(np.isfinite(seen), seen - pixels, 1e3)
 
     def residuals(numbers: Array) -> Array:
@@ -342,19 +342,19 @@ def _jacobian(residuals: Callable[[Array], Array], at: Array, here: Array, owner
     return out
 
 
-def _hold_out(looks: _Looks, start: tuple[Array, Array], arm: ArmAccuracy) -> dict[str, float]:
+def _hold_out(observations: _Observations, start: tuple[Array, Array], arm: ArmAccuracy) -> dict[str, float]:
     """Each quarter of the poses kept aside once: their boards, predicted by the arm alone, against where they are."""
     gaps_px, turns, shifts = [], [], []
     for fold in range(FOLDS):
-        aside = np.arange(len(looks.views)) % FOLDS == fold
+        aside = np.arange(len(observations.views)) % FOLDS == fold
         if (~aside).sum() < LEAST_POSES - 1 or not aside.any():
             continue
-        solved = _solve(looks.some(~aside), start, arm)
-        for view, moved in zip(looks.some(aside).views, looks.moved[aside]):
+        solved = _solve(observations.some(~aside), start, arm)
+        for view, moved in zip(observations.some(aside).views, observations.moved[aside]):
             predicted = solved.camera_from_mount @ moved @ solved.held_from_board
             points = view.points_m @ predicted[:3, :3].T + predicted[:3, 3]
-            gaps_px.append(looks.model.project(points) - view.pixels)
-            seen = board_pose(looks.model, view)[0]
+            gaps_px.append(observations.model.project(points) - view.pixels)
+            seen = board_pose(observations.model, view)[0]
             off = inverse_poses(predicted) @ seen
             turns.append(angle_deg(off[:3, :3]))
             shifts.append(1e3 * float(np.linalg.norm(predicted[:3, 3] - seen[:3, 3])))

@@ -2,7 +2,7 @@
 
 `offset_s` is what must be ADDED to the other stream's stamps so that they mean the same instants as the reference's
 (`time_ns + offset_ns`). It is found together with a constant displacement between the two (calibration errors, another
-point of the body), so only the motion's course in time counts. Motion that no interpolation can follow (impacts) is
+point of the body), so only the motion over time counts. Motion that no interpolation can follow (impacts) is
 left out. Offsets of several tosses are pooled by their variances, widened where they scatter more than they should.
 """
 
@@ -37,14 +37,14 @@ RIG_TURN, RIG_SHIFT_M = 0.003, 0.003
 OPEN_TURN, OPEN_SHIFT_M = 0.1, 0.1
 """The same where only a rough place is known."""
 POINT_M, FRAME_TURN, FRAME_SHIFT_M = 0.1, 0.02, 0.02
-"""The same between two courses: another point of the body, another frame."""
+"""The same between two trajectories: another point of the body, another frame."""
 HUBER = 2.5
 LEAST_FRAMES = 4
 
 
 @dataclass(frozen=True, eq=False)
 class Path3:
-    """A body's course: times in s, positions, and rotations where known."""
+    """A body's trajectory: times in s, positions, and rotations where known."""
 
     time_s: Float[Array, " n"]
     position_m: Float[Array, "n 3"]
@@ -55,7 +55,7 @@ class Path3:
         return Path3(time_s, poses[:, :3, 3], poses[:, :3, :3])
 
     def smooth_at(self, time_s: Float[Array, " m"]) -> Bool[Array, " m"]:
-        """Where interpolation can be trusted: inside the course, no gap, no impact within the four frames around."""
+        """Where interpolation can be trusted: no end, no gap, no impact within the four frames around."""
         step = np.median(np.diff(self.time_s))
         after = np.searchsorted(self.time_s, time_s)
         inside = (after >= 1) & (after < len(self.time_s))
@@ -109,11 +109,11 @@ class TimeOffset:
     std_s: float
     frames: int
     rms: float
-    """What is left over: mm between courses, px between corners."""
+    """What is left over: mm between trajectories, px between corners."""
 
 
 def offset_of_paths(reference: Path3, other: Path3) -> TimeOffset:
-    """Between two courses of one rigid body, in frames that may differ by a constant displacement on either side.
+    """Between two trajectories of one rigid body, in frames that may differ by a constant displacement on either side.
 
     With rotations on the reference the other's point may be anywhere on the body. Raises BadInput where nothing moves.
     """
@@ -134,7 +134,7 @@ def offset_of_corners(
     camera_from_rig: Float[Array, "4 4"],
     frames: Sequence[tuple[float, TargetView]],
 ) -> TimeOffset:
-    """Between a course of poses (rig_from_body) and tag corners that a camera with its own stamps saw: `frames` are
+    """Between a trajectory of poses (rig_from_body) and tag corners that a camera with its own stamps saw: `frames` are
     (stamp in s, corners with their places on the body). The camera's place may be off by a few mm and mrad."""
     return _corner_fit(reference, model, camera_from_rig, frames, RIG_TURN, RIG_SHIFT_M)[0]
 
@@ -176,14 +176,14 @@ def place_by_motion(
     frames = [f for f in frames if len(f[1]) >= 4]
     stamps = np.array([t for t, _ in frames])
     smooth = reference.smooth_at(stamps) if len(frames) else np.zeros(0, dtype=bool)
-    looks = []
+    candidates = []
     for (stamp, view), fine in zip(frames, smooth):
         if fine:
             position, rotation = reference.at(np.array([stamp]))
             back = np.eye(4)
             back[:3, :3], back[:3, 3] = rotation[0].T, -rotation[0].T @ position[0]
-            looks.append([pose @ back for pose, _ in poses_of_points(model, view.points_m, view.pixels)])
-    agreed = most_agreed([look for look in looks if look], 5.0, 0.05)
+            candidates.append([pose @ back for pose, _ in poses_of_points(model, view.points_m, view.pixels)])
+    agreed = most_agreed([c for c in candidates if c], 5.0, 0.05)
     if agreed is None or agreed[1] < LEAST_FRAMES:
         return None
     return _corner_fit(reference, model, agreed[0], frames, OPEN_TURN, OPEN_SHIFT_M)[1]
@@ -198,11 +198,11 @@ def _solve(
     whiten: Float[Array, "n 2 2"] | None,
 ) -> tuple[TimeOffset, Float[Array, " k"]]:
     """Coarse search for the offset, then Gauss-Newton over offset and displacement with robust weights."""
-    course = np.linalg.norm(np.diff(reference.position_m, axis=0), axis=1) / np.diff(reference.time_s)
-    if not len(course) or np.quantile(course, 0.9) < LEAST_SPEED_M_S:
+    speed_m_s = np.linalg.norm(np.diff(reference.position_m, axis=0), axis=1) / np.diff(reference.time_s)
+    if not len(speed_m_s) or np.quantile(speed_m_s, 0.9) < LEAST_SPEED_M_S:
         raise BadInput(
-            f"the body hardly moves ({np.max(course, initial=0):.2f} m/s at most), so its motion shows no time offset; "
-            "wanted a toss"
+            f"the body hardly moves ({np.max(speed_m_s, initial=0):.2f} m/s at most), so its motion shows no time "
+            "offset; wanted a toss"
         )
 
     def residual(numbers: Array) -> Array:

@@ -55,8 +55,8 @@ class Log:
 
 
 class Pace:
-    """How fast work goes on, from the steps told so far: an estimate only where the older and the newer half of them
-    agree; where they do not, the older half is forgotten. What is slow once (loading, compiling) then makes no
+    """How fast work goes on, from the steps reported so far: an estimate only where the older and the newer half of
+    them agree; where they do not, the older half is forgotten. What is slow once (loading, compiling) then makes no
     estimate, rather than a wrong one."""
 
     LEAST_S = 4.0
@@ -65,40 +65,40 @@ class Pace:
     """The paces of both halves differ by less than this factor."""
 
     def __init__(self) -> None:
-        self._told: list[tuple[float, int]] = []
+        self._reports: list[tuple[float, int]] = []
         self._total = 0
 
-    def told(self, now_s: float, done: int, total: int) -> None:
+    def report(self, now_s: float, done: int, total: int) -> None:
         """Another step. Where the work is another one (it starts anew, or has another size), so is the pace."""
-        if self._told and (done < self._told[-1][1] or total != self._total):
-            self._told.clear()
+        if self._reports and (done < self._reports[-1][1] or total != self._total):
+            self._reports.clear()
         self._total = total
-        if not self._told or done > self._told[-1][1]:
-            self._told.append((now_s, done))
+        if not self._reports or done > self._reports[-1][1]:
+            self._reports.append((now_s, done))
         if self._watched() and not self._agree():
-            self._told = self._told[self._middle() :]
+            self._reports = self._reports[self._middle() :]
 
     def left_s(self, now_s: float) -> float | None:
         """Seconds still to go; None where nobody can know."""
         if not self._watched():
             return None
-        end_s, done = self._told[-1]
-        each_s, waited_s = _seconds_each(self._told[self._middle()], self._told[-1]), now_s - end_s
+        end_s, done = self._reports[-1]
+        each_s, waited_s = _seconds_each(self._reports[self._middle()], self._reports[-1]), now_s - end_s
         if waited_s > self.AGREE * each_s + self.LEAST_S:  # a step that takes longer than those before it
             return None
         return max(each_s * (self._total - done) - waited_s, 0.0)
 
     def _watched(self) -> bool:
-        return len(self._told) > 2 and self._told[-1][0] - self._told[0][0] >= self.LEAST_S
+        return len(self._reports) > 2 and self._reports[-1][0] - self._reports[0][0] >= self.LEAST_S
 
     def _middle(self) -> int:
         """The step nearest to the middle of the time that was watched."""
-        half_s = 0.5 * (self._told[0][0] + self._told[-1][0])
-        return min(range(1, len(self._told) - 1), key=lambda i: abs(self._told[i][0] - half_s))
+        half_s = 0.5 * (self._reports[0][0] + self._reports[-1][0])
+        return min(range(1, len(self._reports) - 1), key=lambda i: abs(self._reports[i][0] - half_s))
 
     def _agree(self) -> bool:
-        middle = self._told[self._middle()]
-        older, newer = _seconds_each(self._told[0], middle), _seconds_each(middle, self._told[-1])
+        middle = self._reports[self._middle()]
+        older, newer = _seconds_each(self._reports[0], middle), _seconds_each(middle, self._reports[-1])
         return max(older, newer) <= self.AGREE * min(older, newer)
 
 
@@ -124,7 +124,7 @@ class Console:
 
     def step(self, done: int, total: int, note: str = "") -> None:
         now = time.monotonic()
-        self._pace.told(now, done, total)
+        self._pace.report(now, done, total)
         elapsed, last = now - self._started_s, done >= total
         if elapsed < self.FIRST_SHOWN_S or (last and self._ended) or not self._due(now, last):
             return

@@ -61,5 +61,5 @@ def _finished(path: Path, info: dict[str, object]) -> FinishedFile:
     with McapFile(path) as file:
         stops, own = file.metadata(STOP), file.metadata("tosslab")
     streams = json_object(stops[-1].get("streams", "")) if stops else {}
-    told = json_object(own[0].get("info", "")) if own else {}
-    return FinishedFile(file_sha256(path), streams, {**told, **info})
+    stored = json_object(own[0].get("info", "")) if own else {}
+    return FinishedFile(file_sha256(path), streams, {**stored, **info})

@@ -44,7 +44,7 @@ def instants(motion: Motion) -> list[float]:
 def frame(lab: Lab, motion: Motion, time_s: float) -> None:
     """One colour image with blur, one depth image, the truth masks."""
     lab.color(motion, time_s, 0)
-    lab.depth(lab.sight(motion, time_s), 0, 0)
+    lab.depth(lab.g_buffer(motion, time_s), 0, 0)
 
 
 def rows() -> list[Row]:

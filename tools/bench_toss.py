@@ -64,11 +64,11 @@ def toss_by_toss(seed: int, tosses: list[int]) -> Any:
     from acquisition.synthetic.show import Show
 
     show = Show(SyntheticConfig(seed=seed, color_size=(212, 120)))
-    base = show.lab.believed_world_from_base
+    base = show.lab.calibrated_world_from_base
     assert base is not None
     eye = Eye(
         show.lab.d455.camera,
-        show.lab.believed_world_from_d455,
+        show.lab.calibrated_world_from_d455,
         1,
         arm_model("panda"),
         Transform("world", "base", base.rotation, base.translation_m),
@@ -78,7 +78,7 @@ def toss_by_toss(seed: int, tosses: list[int]) -> Any:
         rng = np.random.default_rng((seed, toss))
         end_s = motion.instants.end_s
         times_s = np.arange(rng.uniform(0, 1 / 30), end_s, 1 / 30)
-        raws = [show.lab.depth(show.lab.sight(motion, t), toss, k) for k, t in enumerate(times_s)]
+        raws = [show.lab.depth(show.lab.g_buffer(motion, t), toss, k) for k, t in enumerate(times_s)]
         swing = motion.swing
         assert swing is not None
         widths = [

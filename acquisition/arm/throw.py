@@ -57,7 +57,7 @@ class Throw:
         self._arm, self._gripper, self._plan = arm, gripper, plan
         self._open = open_width_m, open_speed_m_s
         self._stop = threading.Event()
-        self._told: set[str] = set()
+        self._reported: set[str] = set()
         self._refused = ""
         self.sent_host_ns: int | None = None
         self._thread = threading.Thread(target=self._open_in_time, name="release", daemon=True)
@@ -102,8 +102,8 @@ class Throw:
             found.append(Trouble(now, "gripper", "gripper", command.error or "it did not succeed", "error"))
         elif command is not None and command.acknowledged_host_ns is None and late:
             found.append(Trouble(now, "gripper", "gripper", f"no answer within {ANSWERS_WITHIN_S:g} s", "error"))
-        fresh = [t for t in found if t.kind not in self._told]
-        self._told |= {t.kind for t in fresh}
+        fresh = [t for t in found if t.kind not in self._reported]
+        self._reported |= {t.kind for t in fresh}
         return fresh
 
     def _open_in_time(self) -> None:

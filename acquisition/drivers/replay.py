@@ -243,8 +243,8 @@ class _Replayed:
         return Health(received={self.name: self._received})
 
     def describe(self) -> dict[str, Any]:
-        told = self._player.session.start.get("rig", {})
-        before = told.get("devices", {}).get(self.name, {}) if isinstance(told, Mapping) else {}
+        recorded_rig = self._player.session.start.get("rig", {})
+        before = recorded_rig.get("devices", {}).get(self.name, {}) if isinstance(recorded_rig, Mapping) else {}
         return {
             "kind": "replay",
             "model": f"recorded {before.get('model', self.name)}",

@@ -77,8 +77,8 @@ class UrBody:
         elif command != self._command:
             self._begin(command, numbers, registers)
         self._command = command
-        if self._move is not None and self._move.over and not self._move.told:
-            self._move.told, self.answer = True, wire.DONE
+        if self._move is not None and self._move.over and not self._move.reported:
+            self._move.reported, self.answer = True, wire.DONE
 
     def _begin(self, command: int, numbers: list[float], registers: Mapping[str, float]) -> None:
         if command == wire.Command.STOP_SCRIPT:
@@ -86,8 +86,8 @@ class UrBody:
         elif command == wire.Command.MOVE_J:
             self._servo = None
             self._move = _Move(self.q_target, np.array(numbers[:6]), numbers[6], numbers[7])
-            self._move.told = registers.get("input_int_register_1", 0) == 1  # asynchronous: done is told at once
-            self.answer = wire.DONE if self._move.told else 0
+            self._move.reported = registers.get("input_int_register_1", 0) == 1  # asynchronous: done is told at once
+            self.answer = wire.DONE if self._move.reported else 0
             self.moves += 1
         else:
             if command in (wire.Command.SERVO_STOP, wire.Command.STOP_J):
@@ -112,7 +112,7 @@ class _Move:
         way = float(np.abs(goal - start).max())
         self._duration_s = max(1.875 * way / max(speed, 1e-3), np.sqrt(5.774 * way / max(acceleration, 1e-3)), TICK_S)
         self._at_s = 0.0
-        self.told = False
+        self.reported = False
 
     @property
     def over(self) -> bool:

@@ -61,7 +61,7 @@ def session_document(lab: Lab) -> dict[str, Any]:
             "depth_aligned_to_color": True,
             "pixel_convention": PIXEL_CONVENTION,
         },
-        "T_world_camera": lab.believed_world_from_d455.matrix.tolist(),
+        "T_world_camera": lab.calibrated_world_from_d455.matrix.tolist(),
         "world": "z up, table top is the plane z = 0, metres",
         "camera_frame": "OpenCV (x right, y down, z forward)",
         "table_tags": {
@@ -75,9 +75,9 @@ def session_document(lab: Lab) -> dict[str, Any]:
         },
         "notes": f"simulated, seed {lab.config.seed}",
     }
-    if lab.believed_world_from_base is not None:
+    if lab.calibrated_world_from_base is not None:
         document["arm"] = "franka_panda"
-        document["T_world_base"] = lab.believed_world_from_base.matrix.tolist()
+        document["T_world_base"] = lab.calibrated_world_from_base.matrix.tolist()
     return document
 
 

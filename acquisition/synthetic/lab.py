@@ -1,6 +1,6 @@
 """`Lab`: the still part of a session (room, cameras, object, arm), and what each device sees at any time of a toss.
 
-A driver that streams calls `color`, `sight` and `depth`, `mono` at its own times; `scene.simulate` does so frame by
+A driver that streams calls `color`, `g_buffer` and `depth`, `mono` at its own times; `scene.simulate` does so frame by
 frame.
 """
 
@@ -37,13 +37,13 @@ from acquisition.synthetic.random_draws import (
 from acquisition.synthetic.render import sensors
 from acquisition.synthetic.render.cameras import MONO_NAMES, camera_model, look_at, mono_model, mono_pose
 from acquisition.synthetic.render.optics import (
+    GBuffer,
     Light,
     Placement,
-    Sight,
     StillPicture,
     View,
     picture,
-    sight,
+    render_g_buffer,
     still_picture,
 )
 from acquisition.synthetic.render.rays import Body, Placed, Standing
@@ -75,13 +75,13 @@ class Lab:
         self.room = Standing([Body("room", mesh) for mesh in room.meshes])
         self.light = Light(config.light)
         self.arm = Arm(config.arm, grasp(config.object, self.solid)) if config.arm else None
-        self.believed_world_from_d455, self.believed_world_from_base = self._believed()
+        self.calibrated_world_from_d455, self.calibrated_world_from_base = self._calibrated()
         self.planner = Planner(config, self.solid, self.mass, self.object, self.d455, self.arm)
         fixed = generator(config.seed, FIXED_PATTERN)
         size = (config.camera.width, config.camera.height)
         self._depth_sensor = sensors.DepthSensor(config.depth, *size, self.d455.camera.fx, fixed)
 
-    def _believed(self) -> tuple[Transform, Transform | None]:
+    def _calibrated(self) -> tuple[Transform, Transform | None]:
         """world_from_d455 and world_from_base as the calibration has them: each off by its own error, and both by one
         of the plane that defines the world."""
         errors, rng = self.config.errors, generator(self.config.seed, ERRORS)
@@ -159,16 +159,16 @@ class Lab:
         signal = sensors.exposed(light, self.color_gain * brightness, config.exposure_s, config.noise, rng)
         return sensors.color_image(signal)
 
-    def sight(self, motion: Motion, time_s: float) -> Sight:
+    def g_buffer(self, motion: Motion, time_s: float) -> GBuffer:
         """What is exactly in front of each pixel of the colour camera."""
-        return sight(self.d455, self.still, self.placed(motion, time_s))
+        return render_g_buffer(self.d455, self.still, self.placed(motion, time_s))
 
-    def depth(self, seen: Sight, toss: int, index: int) -> UInt16[Array, "h w"]:
-        """The depth image that the sensor makes of a sight."""
+    def depth(self, seen: GBuffer, toss: int, index: int) -> UInt16[Array, "h w"]:
+        """The depth image that the sensor makes of a G-buffer."""
         rng = generator(self.config.seed, DEPTH, toss, index)
         return self._depth_sensor.measure(seen.depth_m, seen.facing, self._weakness(seen), rng)
 
-    def _weakness(self, seen: Sight) -> Float32[Array, "h w"]:
+    def _weakness(self, seen: GBuffer) -> Float32[Array, "h w"]:
         """Dark surfaces return little of the projector's pattern, glossy ones mirror it away or into the lens."""
         weak = np.ones(seen.depth_m.shape, np.float32)
         on_object = seen.mask([0])
@@ -206,7 +206,7 @@ class Lab:
     ) -> tuple[UInt8[Array, "h w 3"], UInt16[Array, "h w"], list[Array]]:
         """The calibration board at rest, seen by all cameras: colour, depth in the device's unit, mono images."""
         placed = [Placed(self._board, Transform("world", "body", *_parts(world_from_board)))]
-        seen = sight(self.d455, self.still, placed)
+        seen = render_g_buffer(self.d455, self.still, placed)
         rngs = [generator(self.config.seed, MONO_PLACES, 1000 + number, k) for k in range(2 + len(self.mono_views))]
         plain = np.ones(seen.depth_m.shape, np.float32)
         depth = self._depth_sensor.measure(seen.depth_m, seen.facing, plain, rngs[0])

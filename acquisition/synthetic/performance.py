@@ -60,7 +60,7 @@ def perform(lab: Lab, motion: Motion, fps: float, progress: Progress | None = No
         "d455/color": (color_s, lambda t, k: lab.color(motion, t, k)),
         "d455/depth": (
             color_s + lab.config.depth.delay_s,
-            lambda t, k: lab.depth(lab.sight(motion, t), motion.toss, k),
+            lambda t, k: lab.depth(lab.g_buffer(motion, t), motion.toss, k),
         ),
     }
     for number, view in enumerate(lab.mono_views):

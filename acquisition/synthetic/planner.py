@@ -25,7 +25,7 @@ LOWEST_POINT_M = -0.01
 """An impact may press the object so deep into the table, a hand may not."""
 HELD_STEP_S = 0.004
 ROLL_RAD = 0.5
-LOOKS = 40
+SAMPLED_INSTANTS = 40
 """At how many instants it is checked that the object is in view."""
 
 
@@ -116,7 +116,7 @@ class Planner:
     def _all_seen(self, part: Trajectory) -> bool:
         """Whether the object is inside the image, not too near to the camera, and over the table, all the time."""
         camera = self._view.camera
-        for time_s in part.times_s[:: max(1, len(part.times_s) // LOOKS)]:
+        for time_s in part.times_s[:: max(1, len(part.times_s) // SAMPLED_INSTANTS)]:
             points = part.at(time_s).points(self._solid.vertices_m)
             local = self._view.camera_from_world.points(points)
             if local[:, 2].min() < NEAREST_OBJECT_M or not camera.sees(camera.project(local)).all():

@@ -45,7 +45,7 @@ def draw_release(config: SceneConfig, radius_m: float, rng: np.random.Generator)
     )
 
 
-def brightness_course(config: SceneConfig, toss: int, times_s: Float[Array, " n"]) -> Float[Array, " n"]:
+def brightness_over_time(config: SceneConfig, toss: int, times_s: Float[Array, " n"]) -> Float[Array, " n"]:
     """Brightness of each frame against the first exposure setting: slow waves, `drift` at the most."""
     rng = generator(config.seed, COLOR, toss)
     wave = np.zeros_like(times_s)

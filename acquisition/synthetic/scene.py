@@ -16,7 +16,7 @@ from numpy import ndarray as Array
 from acquisition.synthetic.config import SceneConfig
 from acquisition.synthetic.lab import Lab
 from acquisition.synthetic.planner import Motion
-from acquisition.synthetic.random_draws import ARM_NOISE, brightness_course, frame_times, generator
+from acquisition.synthetic.random_draws import ARM_NOISE, brightness_over_time, frame_times, generator
 from recordings.geometry import Transform
 from recordings.progress import Progress, Silent
 
@@ -71,7 +71,7 @@ def simulate(
     progress = progress or Silent()
     motion = lab.plan(toss)
     times, kept, dropped = frame_times(config, toss, motion.instants.end_s)
-    brightness = brightness_course(config, toss, times)
+    brightness = brightness_over_time(config, toss, times)
     frames = []
     for done, nominal in enumerate(kept):
         frames.append(_frame(lab, motion, nominal, float(times[nominal]), float(brightness[nominal])))
@@ -85,8 +85,8 @@ def simulate(
 
 def _frame(lab: Lab, motion: Motion, nominal: int, time_s: float, brightness: float) -> SyntheticFrame:
     delay_s = lab.config.depth.delay_s
-    seen = lab.sight(motion, time_s)
-    depth_seen = seen if delay_s == 0 else lab.sight(motion, time_s + delay_s)
+    seen = lab.g_buffer(motion, time_s)
+    depth_seen = seen if delay_s == 0 else lab.g_buffer(motion, time_s + delay_s)
     mask = seen.mask([0])
     return SyntheticFrame(
         nominal,

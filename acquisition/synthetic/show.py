@@ -139,9 +139,9 @@ class Show:
         if not self.rendered:
             return RigCalibration(self.cameras(), created_unix_s=time.time(), residuals=made)
         lab = self.lab
-        transforms = [lab.believed_world_from_d455]
-        if lab.believed_world_from_base is not None:
-            t = lab.believed_world_from_base
+        transforms = [lab.calibrated_world_from_d455]
+        if lab.calibrated_world_from_base is not None:
+            t = lab.calibrated_world_from_base
             transforms.append(Transform("world", "base", t.rotation, t.translation_m))
         transforms += [v.world_from_camera for v in lab.mono_views[: self.config.mono_cameras]]
         return RigCalibration(

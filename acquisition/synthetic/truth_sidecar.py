@@ -64,7 +64,7 @@ def _write_toss(lab: LabState, toss: Toss, folder: Path) -> None:
         name: {str(frame): stage.exposed_ns(stream, frame) - int(exposed_ns[0]) for frame in _frames(toss, name)}
         for name, stream in _streams(toss).items()
     }
-    told = {
+    document = {
         "release_time_s": start_ns / 1e9 + instants.release_s - exposed_ns[0] / 1e9,
         "first_contact_time_s": start_ns / 1e9 + instants.first_impact_s - exposed_ns[0] / 1e9,
         "rest_time_s": start_ns / 1e9 + instants.rest_s - exposed_ns[0] / 1e9,
@@ -72,7 +72,7 @@ def _write_toss(lab: LabState, toss: Toss, folder: Path) -> None:
         "first_color_exposed_host_ns": int(exposed_ns[0]),
         "times_count_from": "the true mid-exposure of the toss's first colour frame",
     }
-    (folder / "toss_gt.json").write_text(json.dumps(told, indent=1) + "\n")
+    (folder / "toss_gt.json").write_text(json.dumps(document, indent=1) + "\n")
     (folder / "exposures_ns.json").write_text(json.dumps(stamps) + "\n")
 
 

@@ -20,7 +20,7 @@ ASIDE_RAD, UP_RAD = np.radians(50.0), np.radians(28.0)
 """How far the eye stands beside the colour camera, around the vertical, and above the table."""
 HALF_VIEW = 0.35
 """Tangent of half the eye's angle of view."""
-LOOKS = 9
+SAMPLED_FRAMES = 9
 """Frames of a toss that the table's colours are the mean of."""
 ON_TABLE_M, ON_TABLE_SHARE = 0.015, 0.02
 """Depth that differs from the plane's by less than this, and this share of it, is the table's."""
@@ -51,7 +51,7 @@ class Table:
         plane_m = _plane_depth_m(camera, world_from_camera)
         try:
             frames = toss.rgbd(camera.frame)
-            for i in np.unique(np.linspace(0, len(frames) - 1, LOOKS).astype(int)):
+            for i in np.unique(np.linspace(0, len(frames) - 1, SAMPLED_FRAMES).astype(int)):
                 frame = frames[int(i)]
                 near = np.abs(frame.depth_m - plane_m) < ON_TABLE_M + ON_TABLE_SHARE * plane_m
                 pose = track.pose(int(i))

@@ -368,7 +368,7 @@ def _shadow_box(view: View, one: Placed, center_m: tuple[float, float, float], r
 
 
 @dataclass(frozen=True, eq=False)
-class Sight:
+class GBuffer:
     """What a camera's pixel centres see at an instant: depth along the axis, whose it is, facing.
 
     `owner`: -1 the room, otherwise the place in the list of moving bodies.
@@ -382,7 +382,7 @@ class Sight:
         return np.isin(self.owner, np.array(numbers, dtype=np.int8))
 
 
-def sight(view: View, still: StillPicture, placed: Sequence[Placed]) -> Sight:
+def render_g_buffer(view: View, still: StillPicture, placed: Sequence[Placed]) -> GBuffer:
     """Exact depth of the room and the moving bodies."""
     depth, facing = still.depth_m.copy(), still.facing.copy()
     owner = np.full(depth.shape, -1, np.int8)
@@ -397,4 +397,4 @@ def sight(view: View, still: StillPicture, placed: Sequence[Placed]) -> Sight:
         where = (box.y0 + rows // (box.x1 - box.x0), box.x0 + rows % (box.x1 - box.x0))
         depth[where], owner[where] = found["t_hit"][rows], number
         facing[where] = _facing(one, found, rows, rays[rows])
-    return Sight(depth, owner, facing)
+    return GBuffer(depth, owner, facing)

@@ -8,7 +8,7 @@ import pytest
 
 from acquisition.synthetic.lab import Lab
 from acquisition.synthetic.random_draws import exposure_times
-from acquisition.synthetic.render.optics import jitters, picture, sight
+from acquisition.synthetic.render.optics import jitters, picture, render_g_buffer
 
 
 def outline(lab, motion, time_s):
@@ -36,12 +36,12 @@ def test_the_table_lies_at_the_depth_of_its_plane(lab):
 
 def test_the_true_mask_is_the_projected_cube(lab, motion):
     for time_s in (0.0, motion.instants.release_s, motion.instants.first_impact_s, motion.instants.end_s):
-        assert overlap(lab.sight(motion, time_s).mask([0]), outline(lab, motion, time_s)) > 0.995
+        assert overlap(lab.g_buffer(motion, time_s).mask([0]), outline(lab, motion, time_s)) > 0.995
 
 
 def test_the_exact_depth_is_the_objects_surface(lab, motion):
     time_s = motion.instants.first_impact_s - 0.05
-    seen = lab.sight(motion, time_s)
+    seen = lab.g_buffer(motion, time_s)
     rows, columns = np.nonzero(seen.mask([0]))
     pixels = np.stack([columns, rows], -1).astype(np.float64)
     points = lab.d455.camera.back_project(pixels, seen.depth_m[rows, columns].astype(np.float64))
@@ -55,7 +55,7 @@ def test_the_picture_shows_the_object_where_the_mask_is(lab, motion):
         lab.d455, lab.still, lab.light, lambda t: lab.placed(motion, t), [time_s] * 4, np.random.default_rng(0)
     )
     changed = np.abs(light - lab.still.radiance).max(axis=-1) > 1e-6
-    mask = lab.sight(motion, time_s).mask([0])
+    mask = lab.g_buffer(motion, time_s).mask([0])
     assert changed[mask].mean() > 0.99
     # elsewhere only its shadow changes, and only to darker
     outside = ~cv2.dilate(mask.astype(np.uint8), np.ones((5, 5))).astype(bool)
@@ -71,8 +71,8 @@ def test_blur_grows_with_the_exposure_as_the_motion_says(lab, motion, exposure_s
     times = exposure_times(time_s, exposure_s, 16)
     assert np.ptp(times) == pytest.approx(exposure_s * 15 / 16)
     blurred = picture(lab.d455, lab.still, lab.light, lambda t: lab.placed(motion, t), times, np.random.default_rng(0))
-    swept = np.logical_or.reduce([lab.sight(motion, t).mask([0]) for t in times])
-    always = np.logical_and.reduce([lab.sight(motion, t).mask([0]) for t in times])
+    swept = np.logical_or.reduce([lab.g_buffer(motion, t).mask([0]) for t in times])
+    always = np.logical_and.reduce([lab.g_buffer(motion, t).mask([0]) for t in times])
     speed_px = 0.9 * lab.d455.camera.fx / 0.8
     ring = (swept & ~always).sum() / np.sqrt(always.sum())
     assert ring < 12 * exposure_s * speed_px + 1
@@ -91,14 +91,14 @@ def test_lens_distortion_bends_mask_and_depth_alike(altered):
     lab = Lab(altered(camera={"distortion": (-0.2, 0.06, 0.001, -0.001, 0.0)}))
     motion = lab.plan(0)
     assert lab.d455.camera.distortion_model == "brown-conrady"
-    assert overlap(lab.sight(motion, 0.0).mask([0]), outline(lab, motion, 0.0)) > 0.97
+    assert overlap(lab.g_buffer(motion, 0.0).mask([0]), outline(lab, motion, 0.0)) > 0.97
 
 
 def test_things_that_stand_in_front_hide_the_object(arm_lab):
     motion = arm_lab.plan(0)
-    held = arm_lab.sight(motion, 0.0)
+    held = arm_lab.g_buffer(motion, 0.0)
     alone = held.mask([0])
     assert alone.sum() > 0
     only_object = arm_lab.placed(motion, 0.0)[:1]
-    assert sight(arm_lab.d455, arm_lab.still, only_object).mask([0]).sum() >= alone.sum()
+    assert render_g_buffer(arm_lab.d455, arm_lab.still, only_object).mask([0]).sum() >= alone.sum()
     assert (held.owner > 0).sum() > 500

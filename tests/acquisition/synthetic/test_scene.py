@@ -13,7 +13,7 @@ from acquisition.synthetic.config import ErrorConfig
 from acquisition.synthetic.folder import write_session
 from acquisition.synthetic.lab import Lab
 from acquisition.synthetic.presets import PRESETS, SAMPLE, SAMPLE_TOSSES, described, preset
-from acquisition.synthetic.random_draws import brightness_course
+from acquisition.synthetic.random_draws import brightness_over_time
 from acquisition.synthetic.scene import simulate
 from recordings.errors import BadInput
 from recordings.geometry import rotation_angle_rad
@@ -56,18 +56,18 @@ def test_depth_is_later_than_colour_by_what_was_set(short):
 
 
 def test_brightness_drifts_by_the_share_that_was_set(short):
-    course = brightness_course(short, 0, np.linspace(0, 1.5, 45))
+    course = brightness_over_time(short, 0, np.linspace(0, 1.5, 45))
     assert np.abs(course - 1).max() == pytest.approx(0.4)
     assert np.abs(np.diff(course)).max() < 0.2
 
 
 def test_calibration_errors_have_the_size_that_was_set(short):
     lab = Lab(short)
-    off = lab.world_from_d455.inverse() @ lab.believed_world_from_d455
+    off = lab.world_from_d455.inverse() @ lab.calibrated_world_from_d455
     assert np.linalg.norm(off.translation_m) == pytest.approx(0.003)
     assert np.rad2deg(rotation_angle_rad(off.rotation)) == pytest.approx(0.3)
     tilted = Lab(replace(short, errors=ErrorConfig(plane_m=0.003, plane_deg=0.3)))
-    plane = tilted.believed_world_from_d455 @ tilted.world_from_d455.inverse()
+    plane = tilted.calibrated_world_from_d455 @ tilted.world_from_d455.inverse()
     assert abs(plane.translation_m[2]) == pytest.approx(0.003)
     assert np.rad2deg(np.arccos(plane.rotation[2, 2])) == pytest.approx(0.3, rel=1e-3)
 
