@@ -23,7 +23,6 @@ KEYS: dict[str, Key] = {
     "n": "note",
     "q": "quit",
 }
-KEYS_LINE = "keys: s start, x stop, a accept, r reject, d redo, n note, q quit"
 POLL_S = 0.05
 
 

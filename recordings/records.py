@@ -64,16 +64,6 @@ class RgbdFrame:
 
 
 @dataclass(frozen=True, eq=False)
-class MonoFrame:
-    """One grey image of a ground-truth camera."""
-
-    camera: str
-    index: int
-    time_ns: int
-    image: UInt8[Array, "h w"]
-
-
-@dataclass(frozen=True, eq=False)
 class ArmStates:
     """A batch of joint states of the arm, in time order. `finger_width_m` is the distance between the finger pads
     (NaN where the gripper did not report one)."""
@@ -125,19 +115,6 @@ class TossWindow:
     release_time_ns: int | None
     first_impact_time_ns: int | None
     rest_time_ns: int | None
-
-
-@dataclass(frozen=True, eq=False)
-class TagSighting:
-    """One AprilTag in one image, corners in OpenCV's pixel convention, in the order of pupil-apriltags
-    (in the tag's frame x right, y down: (-,+), (+,+), (+,-), (-,-))."""
-
-    camera: str
-    time_ns: int
-    family: str
-    tag_id: int
-    corners_px: Float[Array, "4 2"]
-    sigma_px: float
 
 
 HealthLevel = Literal["info", "warning", "error"]

@@ -229,19 +229,3 @@ class ContactModel:
     physics_source: str
     plane_normal_world: Float[Array, "3"]
     plane_offset_m: float
-
-
-@dataclass(frozen=True)
-class Scores:
-    """Scores of one track or session against ground truth. Percent, degrees, metres, centimetres as named."""
-
-    frames: int
-    lost_frames: int
-    add_auc_percent: float
-    adds_auc_percent: float
-    success_5deg_5cm_percent: float
-    median_rotation_deg: float
-    median_translation_m: float
-    chamfer_cm: float | None
-    chamfer_icp_cm: float | None
-    aligned_by: str

@@ -31,7 +31,6 @@ from calibration.tags.pattern import refine_by_pattern
 from recordings.bounded.limits import open_npz
 from recordings.errors import BadInput, TosslabError
 from recordings.progress import Progress, Silent
-from recordings.records import TagSighting
 
 FAMILY_CELLS = {"tag36h11": 8, "tag25h9": 7, "tag16h5": 6, "tagStandard41h12": 5}
 """Side of the square whose corners the detector gives, in cells. (Families with tens of thousands of codes take minutes
@@ -75,10 +74,6 @@ class TagDetection:
     def sigma_px(self) -> float:
         """Root mean variance of a corner's coordinate."""
         return float(np.sqrt(np.einsum("kii->k", self.covariance_px2).mean() / 2))
-
-    def sighting(self, camera: str, time_ns: int, family: str = "tag36h11") -> TagSighting:
-        """The same as a record that knows its camera and time."""
-        return TagSighting(camera, time_ns, family, self.tag_id, self.corners_px, self.sigma_px)
 
 
 class TagLists(list[list[TagDetection]]):

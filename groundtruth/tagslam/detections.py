@@ -16,11 +16,6 @@ from numpy import ndarray as Array
 from recordings.bounded.limits import copy_unpacked, open_npz
 from recordings.errors import BadInput
 
-APRILTAG_ARRAY = """
-std_msgs/Header header
-apriltag_msgs/Apriltag[] apriltags
-"""
-
 
 @dataclass(frozen=True, eq=False)
 class DetectedTag:
