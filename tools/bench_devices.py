@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from acquisition.devices import Arm, DeviceLost, JointTrajectory, MonoCamera, RgbdCapture
-from acquisition.simulators.child_process import Apart
+from acquisition.simulators.child_process import ChildProcess
 
 SWING_S = 1.2
 SWING_RAD = {7: [0.3, 0.5, 0.0, 0.7, 0.0, 0.4, 0.0], 6: [0.3, 0.4, 0.0, 0.6, 0.0, 0.3]}
@@ -63,7 +63,7 @@ def panda(count: int) -> None:
     from acquisition.drivers.franka import FrankaArm
 
     began = cpu_s()
-    with Apart("fci", host=f"{HOST}1") as simulator:
+    with ChildProcess("fci", host=f"{HOST}1") as simulator:
         with FrankaArm(host=f"{HOST}1", realtime="ignore") as arm:
             missed, ticks, lost = tosses(arm, count)
         server = simulator.snapshot()
@@ -79,7 +79,7 @@ def hand(count: int) -> None:
     from acquisition.drivers.franka_hand import FrankaHand
 
     late_ms = []
-    with Apart("fci", host=f"{HOST}2"), FrankaHand(host=f"{HOST}2") as gripper:
+    with ChildProcess("fci", host=f"{HOST}2"), FrankaHand(host=f"{HOST}2") as gripper:
         gripper.start()
         time.sleep(1.0)  # it learns when states come
         for number in range(count):
@@ -98,7 +98,7 @@ def ur(count: int) -> None:
     from acquisition.drivers.ur import UrArm
 
     began = cpu_s()
-    with Apart("rtde", host=f"{HOST}3"), UrArm(host=f"{HOST}3") as arm:
+    with ChildProcess("rtde", host=f"{HOST}3"), UrArm(host=f"{HOST}3") as arm:
         missed, ticks, lost = tosses(arm, count)
     print(
         f"ur: {count} trajectories of {SWING_S:g} s at 500 Hz: {sum(missed)} of {ticks + sum(missed)} cycles late, "

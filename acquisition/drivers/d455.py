@@ -20,6 +20,7 @@ import numpy as np
 
 from acquisition.devices import DeviceLost, DeviceRefused, Health, Image, RgbdCapture, Stamp
 from acquisition.drivers import realsense_parts as parts
+from acquisition.drivers.lifecycle import OpenedByContext
 from acquisition.drivers.realsense_setup import (
     D455Settings,
     cannot_do,
@@ -38,7 +39,7 @@ QUEUE = 32
 LAST_FRAMES_MS = 300
 
 
-class D455Camera:
+class D455Camera(OpenedByContext):
     """The camera with this serial (None: the only one there), or the recording `file`."""
 
     def __init__(
@@ -68,14 +69,6 @@ class D455Camera:
         self._about: dict[str, Any] = {}
         self._domains: dict[str, str] = {}
         self._unit_m = 0.001
-
-    def __enter__(self) -> D455Camera:
-        self.open()
-        return self
-
-    def __exit__(self, *exc: object) -> None:
-        self.stop()
-        self.close()
 
     # --- life --------------------------------------------------------------------------------------------------
 

@@ -16,6 +16,7 @@ from typing import Any
 from acquisition.devices import DeviceLost, DeviceRefused, GripperCommand, GripperSample, Health
 from acquisition.drivers.franka import check_identity, not_opened
 from acquisition.drivers.inbox import Inbox
+from acquisition.drivers.lifecycle import OpenedByContext
 from acquisition.drivers.workers.franka_hand import SAMPLE
 from acquisition.drivers.workers.process import Worker
 
@@ -27,7 +28,7 @@ SHORTEST_NS = 15_000_000
 SILENT_PERIODS = 4
 
 
-class FrankaHand:
+class FrankaHand(OpenedByContext):
     """The gripper of the Panda at `host`."""
 
     def __init__(self, name: str = "gripper", host: str = "", serial: str | None = None) -> None:
@@ -46,14 +47,6 @@ class FrankaHand:
         self._last_host_ns: int | None = None
         self._period_ns: int | None = None
         self._received = self._dropped = 0
-
-    def __enter__(self) -> FrankaHand:
-        self.open()
-        return self
-
-    def __exit__(self, *exc: object) -> None:
-        self.stop()
-        self.close()
 
     def open(self) -> None:
         """Connect. Raises DeviceNotFound where nothing answers."""

@@ -25,6 +25,7 @@ from acquisition.drivers import usb
 from acquisition.drivers.aravis import STATUS, Aravis, AravisError, Found
 from acquisition.drivers.genicam_setup import GenicamSettings, apply
 from acquisition.drivers.inbox import Inbox
+from acquisition.drivers.lifecycle import OpenedByContext
 from recordings.errors import DeviceNotFound
 
 POP_US = 100_000
@@ -33,7 +34,7 @@ FRAME_ID_BITS = 16
 """GigE Vision 1 counts frames from 1 to 65535 and starts over at 1."""
 
 
-class GenicamCamera:
+class GenicamCamera(OpenedByContext):
     """One grey camera, Mono8. `serial` or `address` (both, to be sure) choose it."""
 
     def __init__(
@@ -57,14 +58,6 @@ class GenicamCamera:
         self._lock = threading.RLock()
         self._leaving: threading.Thread | None = None
         self._counts: tuple[dict[str, int], dict[str, int]] = ({}, {})
-
-    def __enter__(self) -> GenicamCamera:
-        self.open()
-        return self
-
-    def __exit__(self, *exc: object) -> None:
-        self.stop()
-        self.close()
 
     def open(self) -> None:
         """Find it and apply the settings. Raises DeviceNotFound (with what was found) or DeviceRefused."""

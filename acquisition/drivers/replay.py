@@ -39,6 +39,7 @@ from acquisition.devices import (
     RgbdCapture,
     Stamp,
 )
+from acquisition.drivers.lifecycle import OpenedByContext
 from acquisition.ready_rig import Setup
 from acquisition.rig import DeviceEntry, RecordingConfig, Rig
 from recordings.errors import BadInput
@@ -206,7 +207,7 @@ def _samples(arm: ArmStates, rows: Int64[Array, " n"], base: int, now: int) -> A
     return ArmSamples(CLOCK, numbers, arm.time_ns[rows], received, q, dq, none, none, none, ones, modes)
 
 
-class _Replayed:
+class _Replayed(OpenedByContext):
     """Life of a replayed device."""
 
     kind = "replay"
@@ -231,13 +232,6 @@ class _Replayed:
 
     def close(self) -> None:
         self.stop()
-
-    def __enter__(self) -> Any:
-        self.open()
-        return self
-
-    def __exit__(self, *exc: object) -> None:
-        self.close()
 
     def health(self) -> Health:
         return Health(received={self.name: self._received})

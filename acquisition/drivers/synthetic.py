@@ -10,8 +10,7 @@ The scene is that of `acquisition.synthetic`; what is true (poses, exposure time
 
 from __future__ import annotations
 
-from typing import Any
-
+from acquisition.arm.throw import ByHand
 from acquisition.arm.toss import TossPlan
 from acquisition.drivers.synthetic_arm import SyntheticArm, SyntheticGripper
 from acquisition.drivers.synthetic_cameras import SyntheticMono, SyntheticRgbd
@@ -43,7 +42,7 @@ class SyntheticLab(LabState):
         return SyntheticArm(self, name, rate_hz) if kind == "arm" else SyntheticGripper(self, name, rate_hz)
 
 
-class SyntheticThrower:
+class SyntheticThrower(ByHand):
     """Tosses of the simulated lab: planned by its own planner, rendered before they are played."""
 
     def __init__(self, lab: SyntheticLab) -> None:
@@ -57,12 +56,3 @@ class SyntheticThrower:
             self._lab.stage.set_up(self._lab.show.perform(number, plan, progress))
             self._ready = number, plan
         return self._ready[1]
-
-    def over(self) -> bool:
-        return False
-
-    def learn(self, delay_s: float) -> None:
-        pass
-
-    def get_ready(self) -> dict[str, Any]:
-        return {}

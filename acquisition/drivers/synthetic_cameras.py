@@ -117,6 +117,9 @@ class _Camera(SimulatedDevice):
 
     def _delivered(self, made: Any) -> Any:
         """Duplicates and swapped frames are made here."""
+        if self._held_back is not None:
+            self._held_back, self._again = None, self._held_back
+            return made
         if self._faults.active("duplicate") is not None:
             self._again = made
         if self._faults.active("swap") is not None:
@@ -156,9 +159,6 @@ class SyntheticRgbd(_Camera):
         depth = self._image("d455/depth", frame, host_ns, exposure_s)
         without = self._faults.active("no_depth") is not None
         made = RgbdCapture(color, None if without else depth, self._lab.show.depth_unit_m, aligned=True)
-        if self._held_back is not None:
-            made, self._held_back, self._again = made, None, self._held_back
-            return made
         return self._delivered(made)
 
     def set_emitter(self, on: bool) -> None:
@@ -195,9 +195,6 @@ class SyntheticMono(_Camera):
             return None
         made = self._image(self._stream, frame, time.monotonic_ns(), self._lab.show.mono_exposure_s)
         made = replace(made, stream="image")
-        if self._held_back is not None:
-            made, self._held_back, self._again = made, None, self._held_back
-            return made
         return self._delivered(made)
 
     def trigger(self) -> None:

@@ -12,6 +12,7 @@ from acquisition.devices import (
     Health,
     Stamp,
 )
+from acquisition.drivers.lifecycle import OpenedByContext
 from acquisition.synthetic.lab_state import LabState
 
 
@@ -34,7 +35,7 @@ class _Counts:
     dropped: dict[str, int] = field(default_factory=dict)
 
 
-class SimulatedDevice:
+class SimulatedDevice(OpenedByContext):
     """Life and faults of every simulated device."""
 
     def __init__(self, lab: LabState, name: str) -> None:
@@ -66,13 +67,6 @@ class SimulatedDevice:
     def close(self) -> None:
         self.stop()
         self._open = False
-
-    def __enter__(self) -> Any:
-        self.open()
-        return self
-
-    def __exit__(self, *exc: object) -> None:
-        self.close()
 
     def health(self) -> Health:
         received, dropped = dict(self._counts.received), dict(self._counts.dropped)

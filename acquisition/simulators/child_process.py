@@ -1,10 +1,10 @@
 """A simulator in a process of its own, so that the load of the caller's Python does not slow its real-time loop.
 
-    with Apart("fci", host="127.0.0.3") as arm:
+    with ChildProcess("fci", host="127.0.0.3") as arm:
         arm.inject("reflex", at_s=0.5)
         arm.snapshot()     # the simulator's counters, as a dict
 
-The child listens before `Apart(...)` returns and ends with its parent (its standard input closes).
+The child listens before `ChildProcess(...)` returns and ends with its parent (its standard input closes).
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class SimulatorFailed(TosslabError):
     """The child process could not start the simulator, or refused a call."""
 
 
-class Apart:
+class ChildProcess:
     """The simulator `name` of SIMULATORS, started with these keyword arguments in a child process."""
 
     def __init__(self, name: str, **options: Any) -> None:
@@ -43,7 +43,7 @@ class Apart:
         self._child = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
         self._answer()
 
-    def __enter__(self) -> Apart:
+    def __enter__(self) -> ChildProcess:
         return self
 
     def __exit__(self, *exc: object) -> None:

@@ -74,3 +74,17 @@ class Faults:
                     return None
                 self._planned.remove(fault)
         return fault
+
+
+class Faulty:
+    """A simulator into which faults are injected."""
+
+    _faults: Faults
+
+    def inject(self, kind: str, at_s: float = 0.0, for_s: float | None = None, **detail: float | str) -> None:
+        """Plan a fault `at_s` seconds from now, for `for_s` seconds or until cleared."""
+        self._faults.inject(kind, at_s, for_s, **detail)
+
+    def clear(self, kind: str) -> None:
+        """Forget every fault of this kind."""
+        self._faults.clear(kind)

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from acquisition.simulators import fci_wire as wire
-from acquisition.simulators.faults import Faults
+from acquisition.simulators.faults import Faults, Faulty
 from acquisition.simulators.fci_body import TICK_S, FciBody
 from acquisition.simulators.fci_gripper import GRIPPER_FAULTS, GripperServer
 from acquisition.simulators.sockets import Listener, Pacer, loopback, receive
@@ -44,7 +44,7 @@ FIRST_COMMAND_TICKS = 200
 RATE_WINDOW = 100
 
 
-class FciServer:
+class FciServer(Faulty):
     """The arm and its gripper. `version` is the FCI server version it claims; `object_width_m` as in GripperServer."""
 
     def __init__(
@@ -79,10 +79,7 @@ class FciServer:
     def inject(self, kind: str, at_s: float = 0.0, for_s: float | None = None, **detail: float | str) -> None:
         if kind == "reflex" and detail.get("error", "joint_reflex") not in wire.ERRORS:
             raise BadInput(f"no error '{detail['error']}' here; wanted one of {', '.join(wire.ERRORS)}")
-        self._faults.inject(kind, at_s, for_s, **detail)
-
-    def clear(self, kind: str) -> None:
-        self._faults.clear(kind)
+        super().inject(kind, at_s, for_s, **detail)
 
     def snapshot(self) -> dict[str, Any]:
         """Counts, mode and joints; `stretched_s` is by how much the simulator itself was too slow."""

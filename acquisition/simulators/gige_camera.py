@@ -23,7 +23,7 @@ from jaxtyping import UInt8
 from numpy import ndarray as Array
 
 from acquisition.simulators import gige_xml as registers
-from acquisition.simulators.faults import Faults
+from acquisition.simulators.faults import Faults, Faulty
 from acquisition.simulators.sockets import loopback
 
 FAULTS = {
@@ -43,7 +43,7 @@ IMAGE, IMAGE_WITH_CHUNKS = 0x0001, 0x4001
 OVERHEAD = 36
 
 
-class GigeCamera:
+class GigeCamera(Faulty):
     """One camera at a loopback address, until closed. Made inside the network that it is to be found in."""
 
     def __init__(self, address: str, serial: str, clock_ns: int = 0, readout_s: float = 0.005) -> None:
@@ -76,12 +76,6 @@ class GigeCamera:
         """A rising edge on Line0."""
         if self._get(registers.TRIGGER_SOURCE) == registers.LINE0:
             self._trigger()
-
-    def inject(self, kind: str, at_s: float = 0.0, for_s: float | None = None, **detail: float | str) -> None:
-        self._faults.inject(kind, at_s, for_s, **detail)
-
-    def clear(self, kind: str) -> None:
-        self._faults.clear(kind)
 
     def snapshot(self) -> dict[str, Any]:
         strobe = self._get(registers.LINE_MODE) == 1 and self._get(registers.LINE_SOURCE) == 1

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from acquisition.simulators import rtde_wire as wire
-from acquisition.simulators.faults import Faults
+from acquisition.simulators.faults import Faults, Faulty
 from acquisition.simulators.rtde_body import TICK_S, UrBody
 from acquisition.simulators.sockets import Listener, Pacer, loopback, receive
 
@@ -37,7 +37,7 @@ CONTROLLER_VERSION = (5, 12, 0, 0)
 POLYSCOPE = "URSoftware 5.12.0.1101319 (Mar 28 2022)"
 
 
-class UrServer:
+class UrServer(Faulty):
     """The controller. `model` and `serial` are what the dashboard tells."""
 
     def __init__(self, host: str = "127.0.0.1", model: str = "UR5", serial: str = "20195500001") -> None:
@@ -71,12 +71,6 @@ class UrServer:
 
     def __exit__(self, *exc: object) -> None:
         self.close()
-
-    def inject(self, kind: str, at_s: float = 0.0, for_s: float | None = None, **detail: float | str) -> None:
-        self._faults.inject(kind, at_s, for_s, **detail)
-
-    def clear(self, kind: str) -> None:
-        self._faults.clear(kind)
 
     def snapshot(self) -> dict[str, Any]:
         with self._lock:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import os
+import pty
+import sys
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -162,3 +165,14 @@ def needs_aravis() -> None:
         Aravis.get()
     except DeviceNotFound as missing:
         pytest.skip(str(missing))
+
+
+@pytest.fixture
+def terminal(monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
+    """The typing end of a terminal whose other end is standard input."""
+    typing, listening = pty.openpty()
+    with open(listening, closefd=False) as stdin:
+        monkeypatch.setattr(sys, "stdin", stdin)
+        yield typing
+    os.close(typing)
+    os.close(listening)

@@ -5,11 +5,9 @@ from __future__ import annotations
 
 import argparse
 import os
-import pty
 import sys
 import time
 from collections import deque
-from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -281,16 +279,6 @@ def test_an_arm_that_does_not_get_there_is_not_tried_again() -> None:
     with pytest.raises(TosslabError, match="halted; nothing is recovered or tried again by itself"):
         made.prepare(0, 0, Silent())
     assert person.log.count("MOVE") == 1
-
-
-@pytest.fixture
-def terminal(monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
-    typing, listening = pty.openpty()
-    with open(listening, closefd=False) as stdin:
-        monkeypatch.setattr(sys, "stdin", stdin)
-        yield typing
-    os.close(typing)
-    os.close(listening)
 
 
 def test_every_key_stops_also_those_that_mean_nothing(terminal: int) -> None:

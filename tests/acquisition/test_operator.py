@@ -3,26 +3,13 @@
 from __future__ import annotations
 
 import os
-import pty
 import sys
 import termios
-from collections.abc import Iterator
 
 import pytest
 
 from acquisition.operator import Keyboard, Nobody, single_keys
 from acquisition.verdict import Verdict
-
-
-@pytest.fixture
-def terminal(monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
-    """The typing end of a terminal whose other end is standard input."""
-    typing, listening = pty.openpty()
-    with open(listening, closefd=False) as stdin:
-        monkeypatch.setattr(sys, "stdin", stdin)
-        yield typing
-    os.close(typing)
-    os.close(listening)
 
 
 def test_keys_need_no_enter_and_none_is_lost(terminal: int) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 
 from acquisition.devices import ArmMode, ArmSamples, DeviceLost, DeviceRefused, Health, JointTrajectory, Motion
 from acquisition.drivers.inbox import Inbox
+from acquisition.drivers.lifecycle import OpenedByContext
 from acquisition.drivers.workers.arm_rows import BATCH, MODES, row_dtype, samples
 from acquisition.drivers.workers.process import Worker
 from recordings.errors import TosslabError
@@ -23,7 +24,7 @@ START_RAD = 0.02
 """A trajectory may begin this far from where the arm stands; the rest is blended in."""
 
 
-class WorkerArm:
+class WorkerArm(OpenedByContext):
     """An arm behind `python -m module arguments`. A driver gives the texts: `describe`, `not_opened`, `gone`."""
 
     name: str
@@ -52,14 +53,6 @@ class WorkerArm:
         self._last_number: int | None = None
         self._q_desired: np.ndarray | None = None
         self._received = self._dropped = 0
-
-    def __enter__(self) -> WorkerArm:
-        self.open()
-        return self
-
-    def __exit__(self, *exc: object) -> None:
-        self.stop()
-        self.close()
 
     def not_opened(self, kind: str, reason: str) -> TosslabError:
         """The error to raise; `kind` is "missing" (no library), "connect", "silent" or "ended"."""

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from acquisition.simulators.child_process import Apart
+from acquisition.simulators.child_process import ChildProcess
 from acquisition.simulators.gige import PROGRAM
 from acquisition.simulators.network import NotPermitted, own_network
 from recordings.records import ArmStates
@@ -27,20 +27,20 @@ def host() -> str:
 
 
 @pytest.fixture(scope="session")
-def fci() -> Iterator[tuple[str, Apart]]:
+def fci() -> Iterator[tuple[str, ChildProcess]]:
     """A Panda with its gripper: (address, simulator)."""
     pytest.importorskip("panda_py", reason="panda-python is not installed (rig-franka)")
     address = host()
-    with Apart("fci", host=address) as simulator:
+    with ChildProcess("fci", host=address) as simulator:
         yield address, simulator
 
 
 @pytest.fixture(scope="session")
-def rtde() -> Iterator[tuple[str, Apart]]:
+def rtde() -> Iterator[tuple[str, ChildProcess]]:
     """A UR5e controller: (address, simulator)."""
     pytest.importorskip("rtde_control", reason="ur-rtde is not installed (rig-ur)")
     address = host()
-    with Apart("rtde", host=address) as simulator:
+    with ChildProcess("rtde", host=address) as simulator:
         yield address, simulator
 
 

@@ -11,7 +11,7 @@ import pytest
 from acquisition.devices import ArmSamples, DeviceRefused, GripperSample, JointTrajectory
 from acquisition.drivers.franka import FrankaArm, not_opened
 from acquisition.drivers.franka_hand import FrankaHand
-from acquisition.simulators.child_process import Apart
+from acquisition.simulators.child_process import ChildProcess
 from recordings.errors import DeviceNotFound
 
 SWING_RAD = np.array([0.3, 0.5, 0.0, 0.7, 0.0, 0.4, 0.0])
@@ -20,7 +20,7 @@ ATTEMPTS = 4
 
 
 @pytest.fixture(scope="module")
-def arm(fci: tuple[str, Apart]) -> Iterator[FrankaArm]:
+def arm(fci: tuple[str, ChildProcess]) -> Iterator[FrankaArm]:
     with FrankaArm(host=fci[0], realtime="ignore") as opened:
         opened.start()
         yield opened
@@ -92,7 +92,7 @@ def test_what_cannot_be_done_is_refused_with_the_reason(arm: FrankaArm) -> None:
     assert 0.1 < way < 0.65  # it came to rest on its way, not at its end
 
 
-def test_a_reflex_names_itself_and_can_be_left(arm: FrankaArm, fci: tuple[str, Apart]) -> None:
+def test_a_reflex_names_itself_and_can_be_left(arm: FrankaArm, fci: tuple[str, ChildProcess]) -> None:
     simulator = fci[1]
     trajectory = swing(rest(arm), -SWING_RAD * 0.5)
     simulator.inject("reflex", at_s=0.4, error="cartesian_reflex")
@@ -108,7 +108,7 @@ def test_a_reflex_names_itself_and_can_be_left(arm: FrankaArm, fci: tuple[str, A
     assert arm.health().level != "error"
 
 
-def test_missing_commands_end_the_motion_and_single_ones_do_not(arm: FrankaArm, fci: tuple[str, Apart]) -> None:
+def test_missing_commands_end_the_motion_and_single_ones_do_not(arm: FrankaArm, fci: tuple[str, ChildProcess]) -> None:
     simulator = fci[1]
     simulator.inject("lost_packets", share=0.01)
     go(arm, swing(rest(arm), SWING_RAD * 0.5))
@@ -122,7 +122,7 @@ def test_missing_commands_end_the_motion_and_single_ones_do_not(arm: FrankaArm, 
     time.sleep(0.1)
 
 
-def test_the_user_stop_aborts_and_forbids_recovery(arm: FrankaArm, fci: tuple[str, Apart]) -> None:
+def test_the_user_stop_aborts_and_forbids_recovery(arm: FrankaArm, fci: tuple[str, ChildProcess]) -> None:
     fci[1].inject("user_stop", at_s=0.3, for_s=0.7)
     go(arm, swing(rest(arm), SWING_RAD * 0.2))
     assert arm.motion().status == "aborted"
@@ -133,7 +133,7 @@ def test_the_user_stop_aborts_and_forbids_recovery(arm: FrankaArm, fci: tuple[st
     assert arm.health().level != "error"
 
 
-def test_nan_joints_are_passed_on_not_hidden(arm: FrankaArm, fci: tuple[str, Apart]) -> None:
+def test_nan_joints_are_passed_on_not_hidden(arm: FrankaArm, fci: tuple[str, ChildProcess]) -> None:
     rest(arm)
     fci[1].inject("nan_state", for_s=0.1)
     time.sleep(0.2)
@@ -143,7 +143,7 @@ def test_nan_joints_are_passed_on_not_hidden(arm: FrankaArm, fci: tuple[str, Apa
     assert np.isfinite(states.q_desired_rad).all()
 
 
-def test_the_hand_logs_sent_and_acknowledged_and_its_width_between(fci: tuple[str, Apart]) -> None:
+def test_the_hand_logs_sent_and_acknowledged_and_its_width_between(fci: tuple[str, ChildProcess]) -> None:
     address, simulator = fci
     with FrankaHand(host=address) as hand:
         hand.start()
@@ -193,7 +193,7 @@ def _until_acknowledged(hand: FrankaHand) -> list[GripperSample]:
 
 
 def test_another_fci_version_is_refused_and_says_which_is_wanted(free_host: str) -> None:
-    with Apart("fci", host=free_host, version=6), pytest.raises(DeviceRefused, match="version 5"):
+    with ChildProcess("fci", host=free_host, version=6), pytest.raises(DeviceRefused, match="version 5"):
         FrankaArm(host=free_host).open()
 
 

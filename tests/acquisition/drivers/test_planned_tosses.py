@@ -25,7 +25,7 @@ from acquisition.operator import Nobody
 from acquisition.rig import find_rig, read_rig
 from acquisition.run import Options, SessionRun
 from acquisition.setup import NO_CALIBRATION, make_device
-from acquisition.simulators.child_process import Apart
+from acquisition.simulators.child_process import ChildProcess
 from acquisition.streaming.clock import SessionClock
 from acquisition.streaming.recorder import Recorder
 from recordings.geometry import Transform, rotation_exp
@@ -66,7 +66,9 @@ def tool_twist(model: ArmModel, q: np.ndarray, dq: np.ndarray) -> np.ndarray:
     return model.jacobian(q, model.base_from_tool(q).translation_m) @ dq
 
 
-def test_a_planned_toss_of_the_panda_passes_its_supervision_and_releases_as_wanted(fci: tuple[str, Apart]) -> None:
+def test_a_planned_toss_of_the_panda_passes_its_supervision_and_releases_as_wanted(
+    fci: tuple[str, ChildProcess],
+) -> None:
     model = arm_model("panda")
     toss = plan(model, [0.0, -0.2, 0.0, -2.0, 0.0, 2.0, 0.785], [0.0, 0.4, 0.0, 0.7, 0.0, 0.6, 0.0])
     with FrankaArm(host=fci[0], realtime="ignore") as arm:
@@ -85,7 +87,7 @@ def test_a_planned_toss_of_the_panda_passes_its_supervision_and_releases_as_want
     np.testing.assert_allclose(np.mean(found, axis=0), wanted, atol=0.02 * np.linalg.norm(wanted[:3]))
 
 
-def test_a_planned_toss_of_the_ur5e_runs_and_reaches_its_speed(rtde: tuple[str, Apart]) -> None:
+def test_a_planned_toss_of_the_ur5e_runs_and_reaches_its_speed(rtde: tuple[str, ChildProcess]) -> None:
     model = arm_model("ur5e")
     toss = plan(model, [0.0, -1.4, 1.7, -1.9, -1.57, 0.0], [0.0, 0.5, -0.9, -0.5, 0.0, 0.0])
     with UrArm(host=rtde[0]) as arm:
@@ -108,7 +110,7 @@ def test_a_planned_toss_of_the_ur5e_runs_and_reaches_its_speed(rtde: tuple[str, 
     assert 0.7 * wanted_speed < speed < 1.35 * wanted_speed
 
 
-def test_the_shipped_ur5e_rig_tosses(rtde: tuple[str, Apart], tmp_path: Path) -> None:
+def test_the_shipped_ur5e_rig_tosses(rtde: tuple[str, ChildProcess], tmp_path: Path) -> None:
     """Its arm alone, with the toss that the file asks for: to the start, the toss, and what is written of it."""
     shipped = read_rig(find_rig("ur5e"))
     arm = replace(shipped.of_kind("arm")[0], address=rtde[0])
@@ -175,7 +177,7 @@ BASE = Transform("world", "base", rotation_exp(np.array([0.0, 0.0, -np.pi / 2]))
 
 
 def test_toss_record_tosses_with_a_panda(
-    fci: tuple[str, Apart], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    fci: tuple[str, ChildProcess], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Planned, carried out at 1 kHz, released: the fingers' widths tell when, the file holds all of it."""
     monkeypatch.setattr(preflight, "RATE_BAD", 0.9)  # on a busy machine the simulator's seconds are longer than ours

@@ -21,7 +21,7 @@ from acquisition.drivers.franka import FrankaArm
 from acquisition.drivers.ur import UrArm
 from acquisition.operator import Nobody
 from acquisition.rig import DeviceEntry, Rig, TossConfig
-from acquisition.simulators.child_process import Apart
+from acquisition.simulators.child_process import ChildProcess
 from acquisition.streaming.clock import SessionClock
 from acquisition.streaming.recorder import Recorder
 from recordings.errors import TosslabError
@@ -42,7 +42,7 @@ def small_way(name: str, q: np.ndarray) -> JointTrajectory:
     return plan_approach(arm_model(name), SPACE, q, q + np.linspace(0.03, -0.03, len(q))).trajectory
 
 
-def test_a_panda_is_told_its_thresholds_and_its_load(fci: tuple[str, Apart]) -> None:
+def test_a_panda_is_told_its_thresholds_and_its_load(fci: tuple[str, ChildProcess]) -> None:
     address, simulator = fci
     with FrankaArm(host=address, realtime="ignore", collision_torque_nm=16.0, collision_force_n=24.0) as arm:
         told = simulator.snapshot()
@@ -59,7 +59,7 @@ def test_a_panda_is_told_its_thresholds_and_its_load(fci: tuple[str, Apart]) -> 
 
 
 def test_without_a_real_time_kernel_a_panda_is_read_and_not_moved(
-    fci: tuple[str, Apart], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    fci: tuple[str, ChildProcess], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     kernel = tmp_path / "realtime"
     monkeypatch.setattr(franka, "REALTIME", kernel)
@@ -77,7 +77,7 @@ def test_without_a_real_time_kernel_a_panda_is_read_and_not_moved(
     assert fci[1].snapshot()["motions"] == before
 
 
-def test_a_reflex_on_the_way_ends_the_session_and_nothing_recovers_it(fci: tuple[str, Apart]) -> None:
+def test_a_reflex_on_the_way_ends_the_session_and_nothing_recovers_it(fci: tuple[str, ChildProcess]) -> None:
     address, simulator = fci
     entry = DeviceEntry("arm", "arm", "franka", address=address, rate_hz=1000.0)
     arm = FrankaArm(host=address, realtime="ignore")
@@ -108,7 +108,7 @@ def test_a_reflex_on_the_way_ends_the_session_and_nothing_recovers_it(fci: tuple
         assert simulator.snapshot()["recoveries"] == before["recoveries"] + 1
 
 
-def test_a_panda_stands_until_a_key_and_any_key_halts_it(fci: tuple[str, Apart]) -> None:
+def test_a_panda_stands_until_a_key_and_any_key_halts_it(fci: tuple[str, ChildProcess]) -> None:
     address, simulator = fci
     entry = DeviceEntry("arm", "arm", "franka", address=address, rate_hz=1000.0)
     arm = FrankaArm(host=address, realtime="ignore")
@@ -161,7 +161,7 @@ def test_a_panda_stands_until_a_key_and_any_key_halts_it(fci: tuple[str, Apart])
     ],
 )
 def test_a_ur_is_asked_for_safety_mode_and_remote_control_before_it_moves(
-    fault: str, says: str, rtde: tuple[str, Apart]
+    fault: str, says: str, rtde: tuple[str, ChildProcess]
 ) -> None:
     address, simulator = rtde
     with UrArm(host=address) as arm:
@@ -200,7 +200,7 @@ posts = []
 
 
 def test_toss_record_moves_no_panda_for_yes_alone_nor_by_a_place_that_was_made_up(
-    fci: tuple[str, Apart], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    fci: tuple[str, ChildProcess], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     before = fci[1].snapshot()
     rig, out = tmp_path / "rig.toml", tmp_path / "out"

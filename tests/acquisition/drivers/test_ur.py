@@ -11,7 +11,7 @@ import pytest
 from acquisition.devices import ArmSamples, DeviceRefused, JointTrajectory
 from acquisition.drivers import ur
 from acquisition.drivers.ur import UrArm
-from acquisition.simulators.child_process import Apart
+from acquisition.simulators.child_process import ChildProcess
 from recordings.errors import DeviceNotFound
 
 SWING_RAD = np.array([0.3, 0.4, 0.0, 0.6, 0.0, 0.3])
@@ -19,7 +19,7 @@ SWING_S = 1.0
 
 
 @pytest.fixture(scope="module")
-def arm(rtde: tuple[str, Apart]) -> Iterator[UrArm]:
+def arm(rtde: tuple[str, ChildProcess]) -> Iterator[UrArm]:
     with UrArm(host=rtde[0]) as opened:
         opened.start()
         yield opened
@@ -65,7 +65,7 @@ def test_a_ur5e_follows_a_joint_trajectory(arm: UrArm) -> None:
     assert share.max() <= 1 + 1e-6
 
 
-def test_a_protective_stop_ends_the_motion_and_can_be_left(arm: UrArm, rtde: tuple[str, Apart]) -> None:
+def test_a_protective_stop_ends_the_motion_and_can_be_left(arm: UrArm, rtde: tuple[str, ChildProcess]) -> None:
     trajectory = swing(rest(arm), -SWING_RAD)
     rtde[1].inject("protective_stop", at_s=0.3)
     states = go(arm, trajectory)
@@ -80,7 +80,7 @@ def test_a_protective_stop_ends_the_motion_and_can_be_left(arm: UrArm, rtde: tup
     assert arm.motion().status == "done", arm.motion().reason
 
 
-def test_the_emergency_stop_forbids_recovery_until_it_is_over(arm: UrArm, rtde: tuple[str, Apart]) -> None:
+def test_the_emergency_stop_forbids_recovery_until_it_is_over(arm: UrArm, rtde: tuple[str, ChildProcess]) -> None:
     rtde[1].inject("user_stop", for_s=0.5)
     time.sleep(0.2)
     assert "emergency stop" in arm.health().message
@@ -97,7 +97,7 @@ def test_the_emergency_stop_forbids_recovery_until_it_is_over(arm: UrArm, rtde: 
 
 
 def test_without_remote_control_it_is_refused(free_host: str) -> None:
-    with Apart("rtde", host=free_host) as controller:
+    with ChildProcess("rtde", host=free_host) as controller:
         controller.inject("no_script")
         with pytest.raises(DeviceRefused, match="remote control"):
             UrArm(host=free_host).open()

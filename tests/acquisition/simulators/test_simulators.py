@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from acquisition.simulators import fci_wire, rtde_wire
-from acquisition.simulators.child_process import Apart, SimulatorFailed
+from acquisition.simulators.child_process import ChildProcess, SimulatorFailed
 from acquisition.simulators.faults import Faults
 from acquisition.simulators.fci import FciServer
 from acquisition.simulators.fci_body import TICK_S, FciBody
@@ -122,11 +122,11 @@ def test_a_late_caller_stretches_time_and_never_bursts() -> None:
 
 def test_a_simulator_apart_obeys_and_refuses_by_words() -> None:
     host = f"127.{20 + os.getpid() % 200}.251.1"
-    with Apart("rtde", host=host, serial="77") as robot:
+    with ChildProcess("rtde", host=host, serial="77") as robot:
         with pytest.raises(SimulatorFailed, match="no fault 'flood' here"):
             robot.inject("flood")
         with pytest.raises(SimulatorFailed, match="in use"):
-            Apart("rtde", host=host)
+            ChildProcess("rtde", host=host)
         with socket.create_connection((host, rtde_wire.DASHBOARD_PORT), timeout=2.0) as dashboard:
             lines = dashboard.makefile("rw")
             assert "Dashboard" in lines.readline()
