@@ -1,7 +1,7 @@
 # `make demo` and `make test` on a fresh clone are enough: both make .venv first, the demo only what the commands need.
 # One that has pip if there is one: Debian keeps it apart (tools/make_venv.py brings it then).
 PYTHON := $(firstword $(shell for needs in venv,ensurepip venv; do for p in python3.11 python3.12 python3.13; do \
-	$$p -c "import $$needs" 2>/dev/null && echo $$p; done; done))
+	$$p -c "import $$needs" 2>/dev/null && echo $$p; done; done; true))
 BIN := .venv/bin
 STAMP := .venv/.installed
 BASE := .venv/.installed-base
