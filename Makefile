@@ -36,11 +36,14 @@ demo: $(BASE)
 	$(BIN)/python tools/judge_demo.py $(OUT)/results
 	@echo "look at $(OUT)/result.png and $(OUT)/results/report.html, open $(OUT)/result.rrd: $(BIN)/toss-view $(OUT)/results"
 
+# One process a core, a file's tests in one of them (tests/conftest.py); more threads would only wait for each other.
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n logical --maxprocesses 8 --dist loadgroup
+
 test: $(STAMP)
-	$(BIN)/python -m pytest -q -m "not slow and not gpu and not rig"
+	$(PYTEST) -m "not slow and not gpu and not rig"
 
 test-all: $(STAMP)
-	$(BIN)/python -m pytest -q -m "not gpu and not rig"
+	$(PYTEST) -m "not gpu and not rig"
 
 check: $(STAMP)
 	$(BIN)/python tools/check.py
