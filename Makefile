@@ -1,5 +1,7 @@
 # `make demo` and `make test` on a fresh clone are enough: both make .venv first, the demo only what the commands need.
-PYTHON := $(shell for p in python3.11 python3.12 python3.13; do $$p -c 'import venv, ensurepip' 2>/dev/null && echo $$p && break; done)
+# One that has pip if there is one: Debian keeps it apart (tools/make_venv.py brings it then).
+PYTHON := $(firstword $(shell for needs in venv,ensurepip venv; do for p in python3.11 python3.12 python3.13; do \
+	$$p -c "import $$needs" 2>/dev/null && echo $$p; done; done; true))
 BIN := .venv/bin
 STAMP := .venv/.installed
 BASE := .venv/.installed-base
@@ -12,8 +14,8 @@ EXTRAS := dev,sim,learned,rig-realsense,rig-franka,rig-ur
 setup: $(STAMP)
 
 $(BASE): pyproject.toml constraints.txt
-	@test -n "$(PYTHON)" || { echo "no Python 3.11, 3.12 or 3.13 with venv found; as root, type: apt-get update && apt-get install -y python3-venv" >&2; exit 1; }
-	test -x $(BIN)/python || $(PYTHON) -m venv .venv
+	@test -n "$(PYTHON)" || { echo "no Python 3.11, 3.12 or 3.13 found; as root, type: apt-get update && apt-get install -y python3-venv" >&2; exit 1; }
+	test -x $(BIN)/pip || $(PYTHON) tools/make_venv.py .venv
 	$(BIN)/python tools/check_system.py --for demo --bring .venv
 	# torch first and pinned: otherwise another package pulls the newest CUDA build, several gigabytes
 	$(BIN)/python -m pip install -q torch==2.13.0 -c constraints.txt
@@ -34,11 +36,14 @@ demo: $(BASE)
 	$(BIN)/python tools/judge_demo.py $(OUT)/results
 	@echo "look at $(OUT)/result.png and $(OUT)/results/report.html, open $(OUT)/result.rrd: $(BIN)/toss-view $(OUT)/results"
 
+# One process a core, a file's tests in one of them (tests/conftest.py); more threads would only wait for each other.
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n logical --maxprocesses 8 --dist loadgroup
+
 test: $(STAMP)
-	$(BIN)/python -m pytest -q -m "not slow and not gpu and not rig"
+	$(PYTEST) -m "not slow and not gpu and not rig"
 
 test-all: $(STAMP)
-	$(BIN)/python -m pytest -q -m "not gpu and not rig"
+	$(PYTEST) -m "not gpu and not rig"
 
 check: $(STAMP)
 	$(BIN)/python tools/check.py

@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 
 SAMPLE = "sample"
 SAMPLE_FOLDER = Path("samples") / "box_toss"
+SAMPLE_RESULTS = Path("box_toss_results")
+"""Of the shipped sample asked for by name: in the folder one works in, never among the program's installed files."""
 CONTACT = "processing.contact_command"
 BASELINE_ROW = "bundlesdf-1"
 MODEL_ORDER = ("ours", "converged", "joint", "no-cycle", "no-contact", "no-icp", "bundlesdf-10", "contact-only")
@@ -63,7 +65,10 @@ def _add_everyday(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--toss", metavar="I|I-J", help="only these tosses")
     parser.add_argument(
-        "--out", metavar="DIR", type=Path, help="results folder (SESSION/results; of several sessions DIR/<name>)"
+        "--out",
+        metavar="DIR",
+        type=Path,
+        help=f"results folder (SESSION/results; of several sessions DIR/<name>; of `sample` ./{SAMPLE_RESULTS})",
     )
     parser.add_argument("--truth", metavar="DIR", type=Path, help="truth/ or a *_truth folder, opened for scores only")
     parser.add_argument("--model", metavar="RESULTS", type=Path, help="track with a shape that was learned before")
@@ -143,8 +148,8 @@ def process_alone(arguments: dict[str, Any], path: Path, name: str) -> dict[str,
 
 def _logs_of(args: argparse.Namespace, path: Path) -> Path:
     """Where the processes of several sessions keep their logs."""
-    base = args.out if args.out is not None else path if path.is_dir() else path.parent
-    return Path(base) / ".jobs"
+    base = SAMPLE_RESULTS if _by_name(args, path) else path if path.is_dir() else path.parent
+    return Path(base if args.out is None else args.out) / ".jobs"
 
 
 def _refuse_what_is_not_there(args: argparse.Namespace) -> None:
@@ -179,6 +184,11 @@ def _sample_path() -> Path:
     if not path.exists():
         raise BadInput(f"the shipped sample is not at {path}; name a session: toss-process SESSION")
     return path
+
+
+def _by_name(args: argparse.Namespace, path: Path) -> bool:
+    """Whether this is the shipped sample without its path having been given."""
+    return path == _sample_path() and path not in map(Path, args.sessions)
 
 
 def _process(args: argparse.Namespace, path: Path, name: str, several: bool) -> Outcome:
@@ -283,6 +293,8 @@ def _out_folder(args: argparse.Namespace, session: Session, several: bool) -> Pa
     if args.out is not None:
         return args.out / session.path.resolve().stem if several else args.out
     path = session.path
+    if _by_name(args, path):
+        return SAMPLE_RESULTS
     return path / "results" if path.is_dir() else path.with_name(f"{path.stem}_results")
 
 

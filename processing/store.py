@@ -61,7 +61,13 @@ class Store:
     def __init__(self, results: Path) -> None:
         self.results = results
         with _spoken(results):
-            results.mkdir(parents=True, exist_ok=True)
+            try:
+                results.mkdir(parents=True, exist_ok=True)
+            except OSError as refused:
+                if refused.errno in NO_SPACE:
+                    raise
+                reason = (refused.strerror or str(refused)).lower()
+                raise BadInput(f"{results} cannot be made ({reason}); choose another place with --out DIR") from refused
             if not os.access(results, os.W_OK):
                 raise BadInput(f"{results} cannot be written to; choose another place with --out DIR")
 

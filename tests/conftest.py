@@ -22,6 +22,26 @@ settings.register_profile("tosslab", deadline=None, derandomize="CI" in os.envir
 settings.load_profile("tosslab")
 
 
+# Programs that tests kill leave no core file (theirs are inherited from here).
+resource.setrlimit(resource.RLIMIT_CORE, (0, resource.getrlimit(resource.RLIMIT_CORE)[1]))
+
+REAL_TIME = (
+    "acquisition/drivers/",
+    "acquisition/simulators/",
+    "acquisition/test_recorder.py",
+    "acquisition/test_faults.py",
+)
+"""What talks to devices against the clock: one at a time, whatever else runs."""
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """For pytest-xdist's `loadgroup`: a file's tests stay together, for its fixtures; those in real time all do."""
+    for item in items:
+        file = item.path.relative_to(ROOT / "tests").as_posix()
+        item.add_marker(pytest.mark.xdist_group("real time" if file.startswith(REAL_TIME) else file))
+
+
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_call() -> Generator[None, object, object]:
     """A test that plays a full disk limits the size of this process's files: pytest's own log must not meet that."""

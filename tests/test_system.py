@@ -1,12 +1,14 @@
 """A bare machine: which of the system's libraries are needed, how set-up brings them, what is said without them."""
 
 import ctypes.util
+import ensurepip
 import importlib.util
 import json
 import shutil
 import subprocess
 import sys
 import tomllib
+from contextlib import nullcontext
 from importlib import metadata
 from pathlib import Path
 
@@ -21,12 +23,25 @@ COMMANDS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scri
 NO_LIBRARY = "libEGL.so.1: cannot open shared object file: No such file or directory"
 
 
-@pytest.fixture
-def check_system():
-    """tools/check_system.py, which nothing imports otherwise."""
-    spec = importlib.util.spec_from_file_location("tools_check_system", ROOT / "tools" / "check_system.py")
+def tool(name):
+    """A module of tools/, which nothing imports otherwise."""
+    spec = importlib.util.spec_from_file_location(f"tools_{name}", ROOT / "tools" / f"{name}.py")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture
+def check_system():
+    return tool("check_system")
+
+
+@pytest.fixture
+def make_venv(monkeypatch):
+    """tools/make_venv.py on a system that keeps pip apart from its Python, as Debian does."""
+    monkeypatch.syspath_prepend(str(ROOT / "tools"))
+    module = tool("make_venv")
+    monkeypatch.setattr(module, "has_pip", lambda: False)
     return module
 
 
@@ -100,6 +115,40 @@ def test_a_package_s_library_is_kept_once_under_the_name_that_is_asked_for(check
         "libone.so.1": b"library",
         "libtwo.so.5": b"another",
     }
+
+
+def test_a_python_without_pip_gets_it_out_of_debian_s_wheel(make_venv, monkeypatch, tmp_path):
+    wheel = next(Path(ensurepip.__file__).parent.glob("_bundled/pip-*.whl"), None) or next(
+        Path("/usr/share/python-wheels").glob("pip-*.whl")
+    )
+    wheels = tmp_path / "unpacked" / "usr" / "share" / "python-wheels"
+    wheels.mkdir(parents=True)
+    shutil.copy(wheel, wheels)
+    asked = []
+    monkeypatch.setattr(make_venv, "as_root", lambda: None)
+    monkeypatch.setattr(make_venv, "unpacked", lambda names: asked.extend(names) or nullcontext(tmp_path / "unpacked"))
+    assert make_venv.make(tmp_path / "venv")
+    assert asked == ["python3-pip-whl"]
+    said = subprocess.run([tmp_path / "venv" / "bin" / "pip", "--version"], capture_output=True, text=True, check=True)
+    assert str(tmp_path / "venv") in said.stdout
+
+
+def test_where_pip_cannot_be_had_the_line_for_an_administrator_is_given(make_venv, monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(make_venv, "as_root", lambda: None)
+    monkeypatch.setattr(make_venv, "unpacked", lambda names: nullcontext(tmp_path))
+    assert not make_venv.make(tmp_path / "venv")
+    version = f"python{sys.version_info.major}.{sys.version_info.minor}"
+    assert capsys.readouterr().err.endswith(f"apt-get update && apt-get install -y {version}-venv\n")
+
+
+def test_root_installs_the_package_that_makes_environments(make_venv, monkeypatch, tmp_path, capsys):
+    installed = []
+    monkeypatch.setattr(make_venv, "as_root", lambda: [])
+    monkeypatch.setattr(make_venv, "install", lambda prefix, packages: installed.extend(packages))
+    monkeypatch.setattr(make_venv, "bring_pip", lambda folder: True)
+    assert make_venv.make(tmp_path / "venv")
+    assert installed == [f"python{sys.version_info.major}.{sys.version_info.minor}-venv"]
+    assert "installs the system's package" in capsys.readouterr().err
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="shared objects of Linux")

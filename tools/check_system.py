@@ -16,6 +16,8 @@ import shutil
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
@@ -98,10 +100,17 @@ def install(prefix: list[str], packages: list[str]) -> bool:
 
 
 def unpack(packages: list[str], folder: Path) -> None:
-    """Download packages as any user may (lists and files in a folder of our own) and keep their libraries."""
+    """Keep these packages' libraries, and what those load in their turn, in `folder`."""
+    with unpacked([*packages, *BESIDE]) as root:
+        keep(root, folder)
+
+
+@contextmanager
+def unpacked(packages: list[str]) -> Iterator[Path]:
+    """A folder with the files of packages that any user may download (apt's lists and files in it too), then gone."""
     with tempfile.TemporaryDirectory() as scratch:
         own = Path(scratch)
-        for name in ("state/lists/partial", "cache/archives/partial", "files"):
+        for name in ("state/lists/partial", "cache/archives/partial", "files", "root"):
             (own / name).mkdir(parents=True)
         options = [
             f"Dir::State={own / 'state'}",
@@ -109,13 +118,12 @@ def unpack(packages: list[str], folder: Path) -> None:
             f"Dir::Cache={own / 'cache'}",
         ]
         apt = ["apt-get", "-q", *(word for option in options for word in ("-o", option))]
-        if not quietly([*apt, "update"]):
-            return
-        for package in dict.fromkeys([*packages, *BESIDE]):
-            quietly([*apt, "download", package], cwd=own / "files")
+        if quietly([*apt, "update"]):
+            for package in dict.fromkeys(packages):
+                quietly([*apt, "download", package], cwd=own / "files")
         for file in sorted((own / "files").glob("*.deb")):
             quietly(["dpkg-deb", "-x", str(file), str(own / "root")])
-        keep(own / "root", folder)
+        yield own / "root"
 
 
 def keep(root: Path, folder: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import shutil
 import socket
 import subprocess
 import sys
@@ -161,9 +162,8 @@ class Viewer:
         environment = {**os.environ, "RERUN_APP_ONLY": "true"}  # no question about analytics
         if self._headless:
             environment["RUST_LOG"] = "error"  # information and warnings become notices over the picture
-        self._process = subprocess.Popen(
-            [rerun_program(), *arguments], stdout=self._log, stderr=self._log, env=environment
-        )
+        command = [*(_ended_with_us() if self._headless else []), rerun_program(), *arguments]
+        self._process = subprocess.Popen(command, stdout=self._log, stderr=self._log, env=environment)
         self._client = self._connect(port)
 
     def _connect(self, port: int) -> ViewerClient:
@@ -196,6 +196,12 @@ class Viewer:
             return ""
         self._log.seek(0)
         return self._log.read().decode(errors="replace")
+
+
+def _ended_with_us() -> list[str]:
+    """Words before a command by which Linux ends it with the program that started it, killed or not; else none."""
+    setpriv = shutil.which("setpriv")
+    return [setpriv, "--pdeathsig", "TERM"] if setpriv is not None else []
 
 
 def free_port() -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 import time
@@ -46,6 +47,34 @@ def output_bytes(results: Path) -> dict[str, bytes]:
         for p in sorted(results.rglob("*"))
         if p.suffix in (".npz", ".ply", ".png") and p.is_file()
     }
+
+
+@pytest.mark.parametrize("asked", [[], ["sample"]])
+def test_the_sample_by_name_leaves_its_results_where_one_works_not_among_the_installed_files(
+    asked: list[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    class Came(BaseException):  # the command turns an Exception into words
+        pass
+
+    def vision(args: object, session: object, name: str, out: Path) -> None:
+        raise Came(out.resolve())
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("processing.cli._vision", vision)
+    with pytest.raises(Came, match=re.escape(str(tmp_path / "box_toss_results"))):
+        main(asked)
+    with pytest.raises(Came, match=re.escape(str(tmp_path / "elsewhere"))):
+        main([*asked, "--out", "elsewhere"])
+
+
+def test_a_results_folder_that_cannot_be_made_is_one_message_with_what_to_type(
+    sample_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").write_text("no folder")
+    code, _, said = answers(capsys, sample_path, "--out", tmp_path / "file" / "results")
+    assert code == 2
+    assert "--out DIR" in said
+    assert "Traceback" not in said
 
 
 def test_help_answers_at_once_with_a_copyable_example() -> None:

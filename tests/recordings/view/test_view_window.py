@@ -1,6 +1,10 @@
 """The viewer without a window: screenshots, and where it listens."""
 
+import shutil
 import socket
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import cv2
@@ -102,3 +106,29 @@ def test_a_viewer_that_was_closed_leaves_no_process():
     except ViewerFailed as missing:
         pytest.skip(str(missing))
     assert process.poll() is not None
+
+
+@pytest.mark.skipif(shutil.which("setpriv") is None, reason="no setpriv: Linux alone ends a program with its parent")
+@pytest.mark.usefixtures("viewer")
+def test_a_program_that_is_killed_leaves_no_viewer_without_a_window():
+    program = """import time
+from recordings.view.viewer import Viewer
+with Viewer(headless=True, size=(320, 200)) as running:
+    print(running._process.pid, flush=True)
+    time.sleep(600)"""
+    killed = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True)
+    process = Path("/proc") / killed.stdout.readline().strip()
+    assert (process / "exe").exists()
+    killed.kill()
+    killed.communicate()
+    end_s = time.monotonic() + 60
+    while _runs(process) and time.monotonic() < end_s:
+        time.sleep(0.1)
+    assert not _runs(process)
+
+
+def _runs(process):
+    try:
+        return (process / "stat").read_text().rsplit(")")[-1].split()[0] != "Z"
+    except OSError:
+        return False
