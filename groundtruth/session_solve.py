@@ -45,8 +45,8 @@ class SolveConfig:
     false_alarm: float = 0.02
     """A camera is taken to stand elsewhere than calibrated when its place would be contradicted as much by chance in no
     more than this share of sessions without a bump (`Tension.chance` over the cameras tested); tags and other cameras
-    then place it. Of 555 simulated one-toss sessions (tools/bench_bumps.py; 109 of them on fresh seeds) 5 of 187 without
-    a bump name a camera (3 of 36 fresh ones); of bumps by 1-2, 2-3, 3-4, 4-6 mm 17, 48, 91, 99 % are named; poses are
+    then place it. Of 555 simulated one-toss sessions (tools/bench_bumps.py; 109 on fresh seeds) 5 of 187 without a
+    bump name a camera (3 of 36 fresh ones); of bumps by 1-2, 2-3, 3-4, 4-6 mm 17, 48, 91, 99 % are named; poses are
     within two stated deviations in 98 % or more of the sessions of every kind."""
     loose_factor: float = 50.0
     """Its place in the calibration then counts with as many times its standard deviation."""
