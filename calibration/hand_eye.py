@@ -38,6 +38,7 @@ GOOD_PX, WORST_PX = 0.5, 3.0
 FOLDS = 4
 HUBER = 2.5
 STEPS = 30
+ROUNDS, GROWS = 6, 1.05
 DIFFERENCE, POSE_DIFFERENCE = 1e-7, 1e-4
 
 
@@ -262,14 +263,23 @@ class _Observations:
 
 
 def _refine(observations: _Observations, start: tuple[Array, Array], arm: ArmAccuracy) -> _Refined:
-    """Joint least squares; then again with the arm's accuracy that the first round found (between a third and three
-    times of what was assumed)."""
-    first = _solve(observations, start, arm)
-    spare = np.sqrt(max(0.2, 1.0 - 2.0 / len(observations.views)))
-    turn = np.clip(first.robot_deg / np.sqrt(3) / spare, arm.turn_deg / 3, 3 * arm.turn_deg)
-    shift = np.clip(1e-3 * first.robot_mm / np.sqrt(3) / spare, arm.shift_m / 3, 3 * arm.shift_m)
-    found = (first.camera_from_mount, first.held_from_board)
-    return _solve(observations, found, ArmAccuracy(float(turn), float(shift)))
+    """Joint least squares; then again with the arm's accuracy that the first round found, and as long as the poses need
+    a worse arm still: a deviation stated from an arm taken for better than it is holds nothing."""
+    solved, assumed = _solve(observations, start, arm), arm
+    for _ in range(ROUNDS):
+        arm = _measured_arm(solved, assumed, len(observations.views))
+        solved = _solve(observations, (solved.camera_from_mount, solved.held_from_board), arm)
+        worse = _measured_arm(solved, assumed, len(observations.views))
+        if worse.turn_deg < GROWS * arm.turn_deg and worse.shift_m < GROWS * arm.shift_m:
+            break
+    return solved
+
+
+def _measured_arm(solved: _Refined, assumed: ArmAccuracy, poses: int) -> ArmAccuracy:
+    """What the arm's corrections come to by axis; a third of what was assumed at least, for few poses agree by luck."""
+    spare = np.sqrt(max(0.2, 1.0 - 2.0 / poses))
+    turn, shift = solved.robot_deg / np.sqrt(3) / spare, 1e-3 * solved.robot_mm / np.sqrt(3) / spare
+    return ArmAccuracy(max(turn, assumed.turn_deg / 3), max(shift, assumed.shift_m / 3))
 
 
 def _solve(observations: _Observations, start: tuple[Array, Array], arm: ArmAccuracy) -> _Refined:

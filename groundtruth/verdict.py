@@ -20,9 +20,8 @@ GROSS_PX = 3.0
 TABLE_M = 0.005
 """Nor is a table tag that lies farther than this from its place."""
 BUMPED_M, BUMPED_RAD = 0.0015, 0.002
-DOUBTED = 1.5
-"""Places contradicted by as many standard deviations are doubted: of unbumped simulated sessions 7 % of the half on
-which it was chosen (wanted 5 %), 11 % of the other (tools/bench_bumps.py)."""
+DOUBTED = 0.05
+"""Places are doubted that would be contradicted as much in no more than this share of sessions without a bump."""
 OFF_FACTOR = 4.0
 """A tag or camera whose residual is this many times the others' is named."""
 
@@ -120,7 +119,7 @@ def _displaced(solved: Solved) -> list[str]:
         "`toss-calibrate cameras` again before the next toss"
         for name in solved.displaced
     ]
-    if solved.tension > DOUBTED:
+    if solved.by_chance < DOUBTED:
         found.append(
             f"the cameras' places in calibration.json are contradicted by {solved.tension:.1f} standard deviations: "
             f"one may have been bumped a little; deviations of poses are stated {solved.tension:.1f} times as wide"

@@ -9,6 +9,8 @@ its examples find. Each leaves a residual on the views aside, where only the boa
 square in px on our corners. `z`: by how many standard errors ours leaves less than OpenCV's, view by view (below -2:
 worse beyond chance). `published` is the residual that the published lens itself leaves of all views.
 `barry-pair`: both cameras of the stereo set solved together, rotation between them against the published one.
+`paper-hand`: a camera in a robot's hand, by `calibrate_hand_eye` with our lens and with the published one, against the
+published place.
 """
 
 from __future__ import annotations
@@ -28,7 +30,9 @@ from numpy import ndarray as Array
 from calibration.cameras.extrinsics import LEAST_POINTS, calibrate_cameras
 from calibration.cameras.intrinsics import Lens, calibrate_intrinsics
 from calibration.cameras.lens_fit import gain_by_chance, squares_aside
+from calibration.cameras.poses import angle_deg
 from calibration.cameras.targets import Charuco, Chessboard, TargetView, find_target
+from calibration.hand_eye import calibrate_hand_eye
 from recordings.geometry import CameraModel
 
 SETS = Path(os.environ.get("TOSSLAB_CALIBRATION_SETS", Path.home() / ".cache" / "tosslab-calibration"))
@@ -189,13 +193,18 @@ def against(real: RealSet, lens: Lens, size: tuple[int, int], views: Sequence[Ta
     published lens leaves of the views."""
     if not real.published:
         return ""
+    known = published_lens(real, size)
+    left = {v: float(q.mean()) for v, q in squares_aside(known, views, range(len(views))).items()}
+    off = 100 * (lens.model.fx / known.fx - 1)
+    held = abs(off) < max(0.3, 2 * lens.report.uncertainty["focal_percent"])
+    return f"; published {known.fx:.2f} (leaves {rms(left):.4f}): {off:+.2f} % {'held' if held else 'NOT HELD'}"
+
+
+def published_lens(real: RealSet, size: tuple[int, int]) -> CameraModel:
+    """As it was published with the set."""
     fx, fy, cx, cy, *bend = real.published
     matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-    known = CameraModel("mono0", *size, matrix, "brown-conrady" if len(bend) == 5 else "rational", tuple(bend))
-    left = {v: float(q.mean()) for v, q in squares_aside(known, views, range(len(views))).items()}
-    off = 100 * (lens.model.fx / fx - 1)
-    held = abs(off) < max(0.3, 2 * lens.report.uncertainty["focal_percent"])
-    return f"; published {fx:.2f} (leaves {rms(left):.4f}): {off:+.2f} % {'held' if held else 'NOT HELD'}"
+    return CameraModel("color", *size, matrix, "brown-conrady" if len(bend) == 5 else "rational", tuple(bend))
 
 
 def pair() -> str:
@@ -218,6 +227,48 @@ def pair() -> str:
     return text + f" cv2.stereoCalibrate: {opencv_pair(seen, published):.3f} deg"
 
 
+def hand() -> str:
+    """The camera in the robot's hand against eMc.yaml, with the lens of the set's own views and with camera.xml's."""
+    real, lens_views = RealSet(f"{PAPER}/extrinsics/chessboard-*.jpg", REAL["paper"].board), REAL["paper"]
+    images = real.images()
+    if not images:
+        return f"paper-hand     skipped: no {real.pictures} under {SETS}; set TOSSLAB_CALIBRATION_SETS"
+    found, size = find_target(real.board, images), (images[0].shape[1], images[0].shape[0])
+    own = calibrate_intrinsics("color", size, find_target(lens_views.board, lens_views.images())).model
+    folder = SETS / PAPER / "extrinsics"
+    base_from_tool = np.array([visp_pose(folder / f"pose_fPe_{k:02d}.yaml") for k in range(1, len(images) + 1)])
+    text = "paper-hand    "
+    for name, lens in (("our lens", own), ("published lens", published_lens(lens_views, size))):
+        text += f" {name}: {hand_against(lens, found, base_from_tool, visp_pose(folder / 'eMc.yaml'))};"
+    return text
+
+
+def hand_against(
+    lens: CameraModel,
+    found: Sequence[TargetView],
+    base_from_tool: Float[Array, "n 4 4"],
+    published_tool_from_camera: Float[Array, "4 4"],
+) -> str:
+    """How far the camera stands from its published place, and twice the deviation stated for it."""
+    solved = calibrate_hand_eye(lens, found, base_from_tool, "eye-in-hand")
+    gap = solved.camera_from_mount @ published_tool_from_camera
+    sure = solved.report.uncertainty
+    return (
+        f"{1e3 * np.linalg.norm(gap[:3, 3]):.2f} mm (+- {2 * sure['position_mm']:.2f}), "
+        f"{angle_deg(gap[:3, :3]):.3f} deg (+- {2 * sure['direction_deg']:.3f}) from the published place, "
+        f"{solved.report.residuals['rms_px']:.2f} px, aside {solved.report.hold_out['rms_px']:.2f} px "
+        f"{solved.report.hold_out['median_mm']:.2f} mm, {solved.report.verdict}"
+    )
+
+
+def visp_pose(path: Path) -> Float[Array, "4 4"]:
+    """A pose as ViSP writes it: metres, then a rotation vector."""
+    numbers = [float(n) for n in re.findall(r"-?\d+\.\d+(?:e-?\d+)?", path.read_text())]
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = cv2.Rodrigues(np.array(numbers[3:]))[0], numbers[:3]
+    return pose
+
+
 def opencv_pair(seen: Mapping[str, Sequence[TargetView]], published: Float[Array, "3 3"]) -> float:
     """How far OpenCV's own stereo calibration on our corners turns from the published rotation, deg."""
     points = [v.points_m.astype(np.float32) for v in seen["mono0"]]
@@ -228,8 +279,10 @@ def opencv_pair(seen: Mapping[str, Sequence[TargetView]], published: Float[Array
     return float(np.degrees(np.linalg.norm(cv2.Rodrigues(found[5].T @ published)[0])))
 
 
+WITHIN_RIGS = {"barry-pair": pair, "paper-hand": hand}
+
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("sets", nargs="*", help=f"of {', '.join(REAL)}, barry-pair; all where none is named")
-    for name in parser.parse_args().sets or [*REAL, "barry-pair"]:
-        print(pair() if name == "barry-pair" else row(name), flush=True)
+    parser.add_argument("sets", nargs="*", help=f"of {', '.join([*REAL, *WITHIN_RIGS])}; all where none is named")
+    for name in parser.parse_args().sets or [*REAL, *WITHIN_RIGS]:
+        print(WITHIN_RIGS[name]() if name in WITHIN_RIGS else row(name), flush=True)

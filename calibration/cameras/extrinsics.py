@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float
 from numpy import ndarray as Array
 
 from calibration.cameras.bundle import Observations, Scene, Solved, adjust
+from calibration.cameras.lens_forms import still_numbers
 from calibration.cameras.pnp import connected, poses_of_points
 from calibration.cameras.poses import angle_deg, inverse_poses
 from calibration.cameras.targets import TargetView, numbered_marks
@@ -82,7 +83,7 @@ def calibrate_cameras(
     hold_out = _hold_out(setup, solved)
     if lenses_free or freed:
         free = np.isin(names, freed) if freed else np.ones(len(names), dtype=bool)
-        start = replace(solved.scene, free_lenses=free)
+        start = replace(solved.scene, free_lenses=free, still_numbers=tuple(map(still_numbers, solved.scene.models)))
         if freed:
             start = replace(start, shift_m=np.zeros_like(start.shift_m), print_m=None)
         without = adjust(start, seen)

@@ -24,7 +24,8 @@ CHANCE = 2.0
 @dataclass(frozen=True, eq=False)
 class Fit:
     """A lens fitted to views. `aside_px2`: by the number of each view, the mean square of what a lens fitted without it
-    left of a coordinate there, the board's pose found anew."""
+    left of a coordinate there, the board's pose found anew; of rejected views as well, for what one lens cannot explain
+    another may. `hold_out_px`: root mean square of the others."""
 
     solved: Solved
     seen: Observations
@@ -37,21 +38,24 @@ class Fit:
         return self.solved.scene.models[0]
 
     @staticmethod
-    def of(start: CameraModel, views: Sequence[TargetView]) -> Fit:
+    def of(start: CameraModel, views: Sequence[TargetView], still: int = 0) -> Fit:
         """All views, then without those that do not fit; and each quarter of them kept aside once."""
-        solved, seen = solve_lens(start, views, range(len(views)))
+        solved, seen = solve_lens(start, views, range(len(views)), still=still)
         rejected = tuple(v for _, v in bad_views(solved, seen))
         numbers = [v for v in range(len(views)) if v not in rejected]
         if rejected and len(numbers) >= LEAST_VIEWS:
-            solved, seen = solve_lens(start, views, numbers)
+            solved, seen = solve_lens(start, views, numbers, still=still)
         else:
             rejected, numbers = (), list(range(len(views)))
         squares: dict[int, Float[Array, "n 2"]] = {}
         for fold in range(FOLDS):
             aside = numbers[fold::FOLDS]
-            rest, _ = solve_lens(solved.scene.models[0], views, [v for v in numbers if v not in aside])
+            kept = [v for v in numbers if v not in aside]
+            rest, _ = solve_lens(solved.scene.models[0], views, kept, still=still)
             squares |= squares_aside(rest.scene.models[0], views, aside)
         hold_out = float(np.sqrt(np.concatenate([*squares.values()]).mean()))
+        if rejected:
+            squares |= squares_aside(solved.scene.models[0], views, rejected)
         return Fit(solved, seen, rejected, {v: float(q.mean()) for v, q in squares.items()}, hold_out)
 
 
@@ -81,9 +85,10 @@ def solve_lens(
     numbers: Sequence[int],
     free_lens: bool = True,
     print_m: float | None = None,
+    still: int = 0,
 ) -> tuple[Solved, Observations]:
-    """Lens (where free) and board poses from the views of these numbers; with `print_m`, the standard deviation of
-    where the board's marks lie, also their places."""
+    """Lens (where free, without its last `still` numbers) and board poses from the views of these numbers; with
+    `print_m`, the standard deviation of where the board's marks lie, also their places."""
     poses, chosen = np.tile(np.eye(4), (len(views), 1, 1)), []
     for v in numbers:
         found = board_pose(start, views[v])
@@ -106,5 +111,7 @@ def solve_lens(
     one, no = np.eye(4)[None], np.zeros(1, dtype=bool)
     free_views, lens = np.isin(np.arange(len(views)), chosen), np.array([free_lens])
     shift = np.zeros((many, 3))
-    scene = Scene((start,), one, poses, one, no, free_views, no, lens, np.ones(1), no, shift, print_m)
+    scene = Scene(
+        (start,), one, poses, one, no, free_views, no, lens, np.ones(1), no, shift, print_m, still_numbers=(still,)
+    )
     return adjust(scene, seen), seen

@@ -156,15 +156,33 @@ def _find_charuco(target: Charuco, images: Sequence[UInt8[Array, "h w"]]) -> lis
 
 
 def _find_chessboard(target: Chessboard, image: UInt8[Array, "h w"]) -> TargetView:
-    import cv2
-
-    found, pixels = cv2.findChessboardCornersSB(image, (target.columns, target.rows), None, cv2.CALIB_CB_ACCURACY)
-    if not found:
+    pixels = _sector_corners(target, image)
+    if pixels is None:
         return NOTHING
     y, x = np.divmod(np.arange(target.columns * target.rows), target.columns)
     points_m = target.square_m * np.stack([x, y, np.zeros_like(x)], -1).astype(np.float64)
     shape = (target.rows, target.columns, 2)
     return TargetView(np.arange(len(x)), points_m, _refined(image, pixels.reshape(shape)), _plain(len(x)))
+
+
+def _sector_corners(target: Chessboard, image: UInt8[Array, "h w"]) -> Float[Array, "n 2"] | None:
+    """Corners by OpenCV's sector-based detector; where it sees none, in the image at half size, at last with its
+    contrast evened out (of 41 real views in lamp light 33, 40 and 41 are found so). cv2.findChessboardCorners finds all
+    41 too, but in shaded ones whole rows of corners beside their places."""
+    import cv2
+
+    smaller = cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    thorough = cv2.CALIB_CB_EXHAUSTIVE
+    tries = (
+        (image, 1.0, cv2.CALIB_CB_ACCURACY),
+        (smaller, 2.0, thorough),
+        (smaller, 2.0, thorough | cv2.CALIB_CB_NORMALIZE_IMAGE),
+    )
+    for seen, scale, flags in tries:
+        found, pixels = cv2.findChessboardCornersSB(seen, (target.columns, target.rows), None, flags)
+        if found:
+            return scale * (pixels.reshape(-1, 2).astype(np.float64) + 0.5) - 0.5
+    return None
 
 
 def _refined(image: UInt8[Array, "h w"], pixels: Float[Array, "r c 2"]) -> Float[Array, "n 2"]:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from calibration.cameras.extrinsics import calibrate_cameras
 from calibration.cameras.intrinsics import calibrate_intrinsics
 from calibration.cameras.lens_fit import solve_lens
 from calibration.cameras.lens_support import unsupported
@@ -42,6 +43,19 @@ def test_corners_of_a_tilted_chessboard_are_not_pulled_along_by_perspective(turn
     wanted = (view.points_m @ pose[:3, :3].T + pose[:3, 3]) @ K.T
     gap = view.pixels - wanted[:, :2] / wanted[:, 2:]
     assert np.sqrt((gap**2).mean()) < 0.05
+
+
+def test_a_board_that_is_found_only_at_half_size_has_its_corners_just_as_well(monkeypatch):
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = Rotation.from_rotvec([0.5, -0.5, 1.0]).as_matrix(), [-0.12, -0.07, 0.7]
+    found_in, image = cv2.findChessboardCornersSB, picture(pose)
+    (whole,) = find_target(BOARD, [image])
+    monkeypatch.setattr(
+        cv2, "findChessboardCornersSB", lambda a, *rest: (False, None) if a.shape == image.shape else found_in(a, *rest)
+    )
+    (half,) = find_target(BOARD, [image])
+    assert half.ids.tolist() == whole.ids.tolist()
+    assert np.abs(half.pixels - whole.pixels).max() < 0.02
 
 
 @pytest.mark.parametrize(
@@ -107,3 +121,47 @@ def test_views_never_seen_are_explained_as_well_as_by_plain_opencv(geometry, see
     known = [replace(v, pixels=v.pixels + 2.0 * (rng.random((len(v), 1)) < 0.01)) for v in known]
     ours = calibrate_intrinsics("mono0", (640, 480), known).model
     assert rms_px(ours, fresh) <= 1.01 * rms_px(opencv_lens(known, (640, 480)), fresh)
+
+
+def corner_views(geometry, true, rng):
+    """Ten views of the image's middle, and one that reaches its corner."""
+    far = geometry.pose([np.pi, 0, 0.3], [-0.21, -0.16, 0.5])
+    middle = [geometry.view(true, geometry.tilted(rng, (0.55, 0.9), 0.05), rng) for _ in range(10)]
+    return middle, geometry.view(true, far, rng)
+
+
+def test_a_corner_of_the_image_that_no_view_reached_is_explained_better_than_by_plain_opencv(geometry):
+    """Where k3 is not told it stays 0: fitted to the noise, it bends what lies farther out by pixels."""
+    true = geometry.camera("mono0", 620.0, distortion_model="brown-conrady", distortion=(-0.17, 0.03, 0.0, 0.0, 0.0))
+    ours, plain = [], []
+    for seed in range(3):
+        middle, far = corner_views(geometry, true, np.random.default_rng(seed))
+        lens = calibrate_intrinsics("mono0", (640, 480), middle, ("brown-conrady",))
+        assert lens.report.details["lens"] == "brown-conrady without k3"
+        ours.append(rms_px(lens.model, [far]))
+        plain.append(rms_px(opencv_lens(middle, (640, 480)), [far]))
+    assert np.linalg.norm(ours) < np.linalg.norm(plain)
+
+
+def test_a_lens_that_bends_by_k3_where_views_reach_is_given_it(geometry):
+    rng = np.random.default_rng(1)
+    true = geometry.camera("mono0", 400.0, distortion_model="brown-conrady", distortion=(-0.3, 0.2, 0.0, 0.0, -0.1))
+    views = [geometry.view(true, geometry.tilted(rng, (0.3, 0.45), 0.1), rng) for _ in range(12)]
+    lens = calibrate_intrinsics("mono0", (640, 480), views, ("none", "brown-conrady"))
+    assert lens.report.details["lens"] == "brown-conrady"
+    assert lens.model.distortion[4] == pytest.approx(-0.1, abs=0.03)
+
+
+def test_lenses_solved_together_keep_k3_where_their_own_views_told_nothing_of_it(geometry):
+    rng = np.random.default_rng(0)
+    bend = {"distortion_model": "brown-conrady", "distortion": (-0.1, 0.02, 0.0, 0.0, 0.0)}
+    pair = {name: geometry.camera(name, 600.0, **bend) for name in ("mono0", "mono1")}
+    beside = geometry.pose([0, 0.1, 0], [-0.1, 0, 0])
+    poses = [geometry.tilted(rng, (0.5, 0.8), 0.08) for _ in range(8)]
+    views = {"mono0": [geometry.view(pair["mono0"], p, rng) for p in poses]}
+    views["mono1"] = [geometry.view(pair["mono1"], beside @ p, rng) for p in poses]
+    placed = calibrate_cameras(pair, views, "mono0", freed=("mono0", "mono1"))
+    for name, model in placed.models.items():
+        assert model.distortion[4] == 0.0
+        assert model.fx != pair[name].fx
+        assert model.fx == pytest.approx(600.0, rel=5e-3)
