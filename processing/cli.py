@@ -17,7 +17,7 @@ from processing import backends
 from processing.engine.each import Engine, InTurn, SideBySide, Stopped
 from processing.engine.jobs import chosen_jobs
 from processing.engine.slurm import AT_ONCE, slurm_jobs
-from processing.engine.workers import Shown, Worker, one_thread_each
+from processing.engine.workers import Shown, Worker
 from processing.given_masks import add_masks_argument
 from processing.variants import CONTACT_ONLY, DEFAULT, NAMES, TRACKERS, WITH_MODEL, rows_of
 from recordings.console import Outcome, Parser, command_parser, progress_for, run_command, shared_board
@@ -127,7 +127,6 @@ def _work(args: argparse.Namespace) -> Outcome:
         raise BadInput("--truth DIR belongs to one session; with several, each one's own truth/ is used")
     if args.truth is not None and not args.truth.is_dir():
         raise BadInput(f"{args.truth} is no truth: wanted a folder, a session's truth/ or a *_truth folder")
-    one_thread_each()
     with _engine(args, sessions[0]) as engine:
         if len(sessions) == 1:
             return _process(args, engine, sessions[0], name, several=False)

@@ -13,7 +13,7 @@ from collections import deque
 from collections.abc import Callable, Hashable, Iterable, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field
-from typing import Protocol, TypeVar
+from typing import Protocol, TypeVar, runtime_checkable
 
 from processing.engine.outcome import Lost, Outcome, raise_if_told
 from recordings.progress import Board
@@ -34,6 +34,7 @@ class Task:
     clear: Callable[[], None]
 
 
+@runtime_checkable
 class Lane(Protocol):
     """Computes one stage at a time."""
 
@@ -46,12 +47,13 @@ class Lane(Protocol):
         ...
 
 
+@runtime_checkable
 class Engine(Protocol):
     """Two verbs: `each` for those who ask, `run` for the store of stages."""
 
     def each(self, items: Iterable[Item], call: Callable[[Item], Found]) -> dict[Item, Found]:
         """`call` of every item, in their order. What the first of them raised is raised, once the others that were
-        begun have ended; no other is begun then."""
+        begun by then have ended; the rest is not begun."""
         ...
 
     def run(self, task: Task) -> None:

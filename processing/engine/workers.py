@@ -19,17 +19,9 @@ from processing.engine.each import Task
 from processing.engine.outcome import Lost, Outcome, outcome_of
 from recordings.progress import Board, Progress, Silent
 
-ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 PRELOADED = ["processing.pipeline"]
 """Imported once, in the process that all workers are forked from (where there is such a one)."""
 TOLD_EVERY_S = 0.2
-
-
-def one_thread_each() -> None:
-    """Libraries that would start a thread per core do their work in one: stages are what runs side by side, and their
-    results do not depend on how many cores there are. To be called before the libraries are imported."""
-    for name in ONE_THREAD:
-        os.environ.setdefault(name, "1")
 
 
 class Worker:
