@@ -8,3 +8,5 @@ import os
 
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
+
+import recordings  # noqa: E402, F401 (names a place for compiled kernels, before numba is loaded)

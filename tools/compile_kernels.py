@@ -78,8 +78,25 @@ def compiled(module: str) -> tuple[str, float]:
     imported, begun = import_module(module), time.process_time()
     for (its, name), signatures in KERNELS.items():
         for types in signatures if its == module else ():
-            getattr(imported, name).compile(f"({', '.join(types)},)")
+            getattr(imported, name).compile(written(types))
     return module, time.process_time() - begun
+
+
+def written(types: tuple[str, ...]) -> str:
+    """As numba reads it."""
+    return f"({', '.join(types)},)"
+
+
+def unforeseen() -> list[str]:
+    """Kernels that this process had compiled for other types than those above."""
+    from numba.core.sigutils import normalize_signature
+
+    found = []
+    for (module, name), signatures in KERNELS.items():
+        foreseen = {normalize_signature(written(types))[0] for types in signatures}
+        used = getattr(import_module(module), name).signatures
+        found += [f"{module}.{name}{types}" for types in used if types not in foreseen]
+    return found
 
 
 if __name__ == "__main__":

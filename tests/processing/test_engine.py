@@ -27,6 +27,7 @@ from processing.store import Store
 from recordings.errors import BadInput, TosslabError, WriteFailed
 from recordings.progress import Board
 
+TOOLS = Path(__file__).resolve().parents[2] / "tools"
 cloudpickle.register_pickle_by_value(sys.modules[__name__])  # a worker cannot import a test
 
 
@@ -322,6 +323,9 @@ def rows(engine, out):
 if __name__ == "__main__":
     board, out = Board(), Path(sys.argv[2])
     rows(InTurn(), out / "one")
+    sys.path.insert(0, sys.argv[3])
+    from compile_kernels import unforeseen
+    assert not unforeseen(), unforeseen()
     with SideBySide([Worker(board), Worker(board)], board) as engine:
         rows(engine, out / "two")
 """
@@ -329,8 +333,8 @@ if __name__ == "__main__":
 
 def test_two_jobs_leave_the_same_bytes_as_one(record_tiny: Any, tmp_path: Path) -> None:
     (tmp_path / "rows.py").write_text(QUICK_ROWS)
-    command = [sys.executable, str(tmp_path / "rows.py"), str(record_tiny(frames=6)), str(tmp_path)]
-    subprocess.run(command, check=True)
+    command = [sys.executable, str(tmp_path / "rows.py"), str(record_tiny(frames=6)), str(tmp_path), str(TOOLS)]
+    subprocess.run(command, check=True)  # which also looks whether the kernels are those that set-up compiles
     one, two = contents(tmp_path / "one"), contents(tmp_path / "two")
     assert len(one) > 30
     assert one == two
