@@ -20,6 +20,7 @@ $(BASE): pyproject.toml constraints.txt
 	# torch first and pinned: otherwise another package pulls the newest CUDA build, several gigabytes
 	$(BIN)/python -m pip install -q torch==2.13.0 -c constraints.txt
 	$(BIN)/python -m pip install -q -e . -c constraints.txt
+	$(BIN)/python tools/compile_kernels.py
 	touch $@
 
 $(STAMP): $(BASE)

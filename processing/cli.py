@@ -3,16 +3,24 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+import sys
+import threading
+import traceback
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from processing import backends
+from processing.engine.each import Engine, InTurn, SideBySide, Stopped
+from processing.engine.jobs import chosen_jobs
+from processing.engine.slurm import AT_ONCE, slurm_jobs
+from processing.engine.workers import Shown, Worker
 from processing.given_masks import add_masks_argument
 from processing.variants import CONTACT_ONLY, DEFAULT, NAMES, TRACKERS, WITH_MODEL, rows_of
-from recordings.console import Outcome, Parser, command_parser, progress_for, run_command
+from recordings.console import Outcome, Parser, command_parser, progress_for, run_command, shared_board
 from recordings.errors import BadInput, TosslabError
 from recordings.notices import Notice
 
@@ -29,6 +37,8 @@ SAMPLE_RESULTS = Path("box_toss_results")
 """Of the shipped sample asked for by name: in the folder one works in, never among the program's installed files."""
 CONTACT = "processing.contact_command"
 BASELINE_ROW = "bundlesdf-1"
+_EVALUATING = threading.Lock()
+"""Reports are drawn one after the other: what draws them keeps the picture it is at for itself."""
 MODEL_ORDER = ("ours", "converged", "joint", "no-cycle", "no-contact", "no-icp", "bundlesdf-10", "contact-only")
 
 
@@ -75,8 +85,9 @@ def _add_everyday(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--table-from-depth", action="store_true", help="where the calibration lacks the table: take it from depth"
     )
+    parser.add_argument("--jobs", metavar="N", type=int, help="stages at a time (cores, fewer where memory is short)")
     parser.add_argument(
-        "--executor", choices=("local", "slurm"), default="local", help="where several sessions run (local processes)"
+        "--executor", choices=("local", "slurm"), default="local", help="where stages run: here, or each as a Slurm job"
     )
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="cpu (default) or cuda")
 
@@ -121,33 +132,55 @@ def _work(args: argparse.Namespace) -> Outcome:
         raise BadInput("--truth DIR belongs to one session; with several, each one's own truth/ is used")
     if args.truth is not None and not args.truth.is_dir():
         raise BadInput(f"{args.truth} is no truth: wanted a folder, a session's truth/ or a *_truth folder")
-    return _process(args, sessions[0], name, several=False) if len(sessions) == 1 else _many(args, sessions, name)
+    with _engine(args, sessions[0]) as engine:
+        if len(sessions) == 1:
+            return _process(args, engine, sessions[0], name, several=False)
+        return _many(args, engine, sessions, name)
 
 
-def _many(args: argparse.Namespace, sessions: Sequence[Path], name: str) -> Outcome:
-    """Every session in a process of its own; one that fails does not stop the others. Then a table over all."""
+@contextmanager
+def _engine(args: argparse.Namespace, first: Path) -> Iterator[Engine]:
+    """What computes the stages: this process, several on this machine, or jobs of a cluster."""
+    jobs, why = (args.jobs or AT_ONCE, None) if args.executor == "slurm" else chosen_jobs(args.jobs)
+    if why is not None:
+        print(f"toss-process: {why}", file=sys.stderr)
+    board = shared_board()
+    if args.executor == "slurm":
+        with SideBySide(slurm_jobs(jobs, _logs_of(args, first)), board) as engine:
+            yield engine
+    elif jobs == 1:
+        yield InTurn()
+    else:
+        with SideBySide([Worker(board) for _ in range(jobs)], board) as engine:
+            yield engine
+
+
+def _many(args: argparse.Namespace, engine: Engine, sessions: Sequence[Path], name: str) -> Outcome:
+    """Sessions side by side; one that fails does not stop the others. Then a table over all."""
     from processing.evaluate.table import summary
-    from processing.executor import Task, run_all
 
-    plain = {k: v for k, v in vars(args).items() if k != "work"}
-    tasks = [Task(path.stem, _logs_of(args, path), (plain, path, name)) for path in sessions]
-    found = run_all(process_alone, tasks, args.executor, progress_for("sessions"))
-    codes = [int(f.pop("exit_code", TosslabError.exit_code)) for f in found]
-    documents = [{"session": t.name, **f} for t, f in zip(tasks, found, strict=True)]
+    found = engine.each(sessions, lambda path: _alone(args, engine, path, name))
+    codes = [int(f.pop("exit_code", TosslabError.exit_code)) for f in found.values()]
+    documents = [{"session": path.stem, **f} for path, f in found.items()]
     return Outcome({"sessions": documents}, summary(documents), max(codes))
 
 
-def process_alone(arguments: dict[str, Any], path: Path, name: str) -> dict[str, Any]:
-    """One of several sessions, in its own process: its document, or why it failed."""
+def _alone(args: argparse.Namespace, engine: Engine, path: Path, name: str) -> dict[str, Any]:
+    """One of several sessions: its document, or why it failed."""
     try:
-        outcome = _process(argparse.Namespace(**arguments), path, name, several=True)
+        outcome = _process(args, engine, path, name, several=True)
+    except Stopped:
+        raise
     except TosslabError as wrong:
         return {"session": str(path), "error": str(wrong), "exit_code": wrong.exit_code}
+    except Exception as wrong:
+        traceback.print_exc(file=sys.stderr)
+        return {"session": str(path), "error": f"{type(wrong).__name__}: {wrong}; its lines are above"}
     return {**outcome.document, "exit_code": outcome.exit_code}
 
 
 def _logs_of(args: argparse.Namespace, path: Path) -> Path:
-    """Where the processes of several sessions keep their logs."""
+    """Where a cluster's jobs keep their logs."""
     base = SAMPLE_RESULTS if _by_name(args, path) else path if path.is_dir() else path.parent
     return Path(base if args.out is None else args.out) / ".jobs"
 
@@ -191,7 +224,7 @@ def _by_name(args: argparse.Namespace, path: Path) -> bool:
     return path == _sample_path() and path not in map(Path, args.sessions)
 
 
-def _process(args: argparse.Namespace, path: Path, name: str, several: bool) -> Outcome:
+def _process(args: argparse.Namespace, engine: Engine, path: Path, name: str, several: bool) -> Outcome:
     from recordings.session import Session
 
     session = Session.open(path)
@@ -199,23 +232,27 @@ def _process(args: argparse.Namespace, path: Path, name: str, several: bool) -> 
         out = _out_folder(args, session, several)
         if name == CONTACT_ONLY:
             return _contact_only(args, session, out)
-        return _vision(args, session, name, out)
+        run = _vision(args, engine, session, name, out)
+        with _EVALUATING:
+            return _evaluate(args, session, out, run)  # truth is opened after every track and shape is written
     finally:
         session.close()
 
 
-def _vision(args: argparse.Namespace, session: Session, name: str, out: Path) -> Outcome:
+def _vision(args: argparse.Namespace, engine: Engine, session: Session, name: str, out: Path) -> Run:
+    """Every row that was asked for."""
     from processing.pipeline import process
+    from processing.run import each
     from processing.start import start_run, with_table
 
     model = None if args.model is None else learned_shape_of(args.model)
     tosses = chosen_tosses(args.toss, session.tosses)
-    run = start_run(session, tosses, out, config_of(args), args.tracker, progress_for, args.device)
+    progress = progress_for if isinstance(engine, InTurn) else Shown()
+    run = start_run(session, tosses, out, config_of(args), args.tracker, progress, args.device, engine)
     run = _started(args, with_table(run) if args.table_from_depth else run)
     rows: list[tuple[Variant, Scope]] = [(WITH_MODEL, "all")] if model is not None else rows_of(name, args.scope)
-    for variant, scope in rows:
-        process(run, variant, scope, model)
-    return _evaluate(args, session, out, run)  # the door to truth is opened after every track and shape is written
+    each(run, rows, lambda row: process(run, *row, model))
+    return run
 
 
 def _started(args: argparse.Namespace, run: Run) -> Run:

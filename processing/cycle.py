@@ -3,18 +3,18 @@ and vision again on those; passes are compared without truth (`passes.py`)."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 from processing import stage_notices as say
 from processing.images import Images
 from processing.passes import Pass, comparison
-from processing.refine.image_residuals import difference
-from processing.run import Run
+from processing.refine.image_residuals import Explained, difference
+from processing.run import Run, both, each
 from processing.stages.contact import learn_contact
 from processing.stages.field import learn_field
-from processing.stages.held_out import halves_of, judge_by_contact, losses_of, why_no_halves
+from processing.stages.held_out import Half, halves_of, judge_by_contact, losses_of, why_no_halves
 from processing.stages.joint import solve_together
 from processing.stages.judge import judge, residuals
 from processing.stages.register import register
@@ -31,11 +31,11 @@ def run_cycle(run: Run, variant: Variant, start: Pass, images: Mapping[int, Imag
     images, config = {t: images[t] for t in start.tracks}, run.config.cycle
     if variant.refined == "joint":
         return _joint(run, start, images, name)
-    refined = with_contact(run, start, images, name) if variant.contact else start
     if variant.refined == "contact":
-        return refined
+        return with_contact(run, start, images, name) if variant.contact else start
     start = replace(start, halves=halves_of(start.tracks, start.shapes))
-    ended, losses = judged_pass(run, start, refined, images, name, variant.icp)
+    refined, halves = learned_from(run, start, images, name, variant.contact)
+    ended, losses = judged_pass(run, start, refined, halves, images, name, variant.icp)
     told = compared(run, start, ended, images, name, losses)
     refined, ended = (replace(x, notes=(*x.notes, *why_no_halves(start.tracks, losses[0]))) for x in (refined, ended))
     if told["worse_share"] > config.much_worse:
@@ -51,62 +51,105 @@ def with_contact(run: Run, start: Pass, images: Mapping[int, Images], name: str)
     Both are judged at the same poses, frame by frame. Poses laid anew onto depth for each shape would hide a wrong
     size (the faces in view can always be met); on recorded tosses they change the difference by less than 0.001 mm.
     """
-    learned = learn_contact(run, name, start.tracks, start.shape)
+
+    def judged(shape: Done) -> Explained:
+        return residuals(judge(run, name, start.tracks, dict.fromkeys(start.tracks, shape), images))
+
+    learned, vision = both(
+        run, lambda: learn_contact(run, name, start.tracks, start.shape), lambda: judged(start.shape)
+    )
     if learned.result.kept_out:
         return replace(start, warnings=(*start.warnings, say.contact_kept_out(name, learned.result.kept_out)))
-    vision, corrected = (
-        residuals(judge(run, name, start.tracks, dict.fromkeys(start.tracks, s), images))
-        for s in (start.shape, learned)
-    )
-    contact, gap = dict.fromkeys(start.tracks, learned), difference(vision, corrected)
+    contact, gap = dict.fromkeys(start.tracks, learned), difference(vision, judged(learned))
     if gap.worse:
         return replace(start, contact=contact, warnings=(*start.warnings, say.contact_shape_worse(name, gap)))
     return replace(start, shapes=contact, contact=contact)
 
 
-def second_pass(run: Run, refined: Pass, images: Mapping[int, Images], name: str, icp: bool) -> Pass:
-    """The shape drawn at its poses (laid onto raw depth first where `icp`), and vision once more on that."""
-    shape, mode = refined.shape, run.config.cycle.start
-    drawn = reproject(run, name, refined.tracks, shape, images, icp)
-    redrawn = {t: drawn_images(run, drawn, shape, images[t]) for t in images}
-    tracks: dict[int, Done] = {t: track(run, redrawn[t], shape, before=drawn) for t in images}
+def learned_from(
+    run: Run, start: Pass, images: Mapping[int, Images], name: str, contact: bool
+) -> tuple[Pass, tuple[Half, ...]]:
+    """With contact where wanted; and what each half of the tosses tells of contact alone. No halves where one of them
+    tells nothing: the other would judge only one way."""
+
+    def half(k: int) -> Half:
+        one = start.halves[k]
+        tracks = {t: start.tracks[t] for t in one.learned_from}
+        return replace(one, contact=learn_contact(run, f"{name}, {one.name}", tracks, one.shape))
+
+    refined, halves = both(run, lambda: with_contact(run, start, images, name) if contact else start,
+                           lambda: each(run, range(len(start.halves)), half))  # fmt: skip
+    usable = all(h.contact is not None and not h.contact.result.kept_out for h in halves.values())
+    return refined, tuple(halves.values()) if usable else ()
+
+
+@dataclass(frozen=True, eq=False)
+class Again:
+    """Vision once more, on a shape drawn at its poses (`drawn`): the tracks in those images."""
+
+    drawn: Mapping[int, Done]
+    tracks: Mapping[int, Done]
+
+    def shape(self, run: Run, name: str, shape: Done, images: Mapping[int, Images]) -> Done:
+        """What the tracks show of a shape that is drawn at the same poses."""
+        believed = shape if run.config.cycle.start == "shape" else None
+        redrawn = {t: drawn_images(run, self.drawn[t], shape, images[t]) for t in images}
+        return learn_field(run, f"{name}, second pass", self.tracks, redrawn, believed)
+
+
+def tracked_again(run: Run, refined: Pass, images: Mapping[int, Images], name: str, icp: bool) -> Again:
+    """The shape drawn at its poses (laid onto raw depth first where `icp`), and the poses once more in that."""
+    shape = refined.shape
+
+    def drawn_and_tracked(toss: int) -> tuple[Done, Done]:
+        drawn = reproject(run, name, refined.tracks[toss], shape, images[toss], icp)
+        return drawn, track(run, drawn_images(run, drawn, shape, images[toss]), shape, before=drawn)
+
+    done = each(run, images, drawn_and_tracked)
+    drawn, tracks = ({t: d[k] for t, d in done.items()} for k in (0, 1))
     seen = {t: d for t, d in tracks.items() if d.result.frames > d.result.lost}
-    if len(seen) >= 2 and mode != "shape":  # else the shape holds them together
-        tracks = {**tracks, **dict.fromkeys(seen, register(run, seen, redrawn, together=True))}
-    shown = learn_field(run, f"{name}, second pass", tracks, redrawn, shape if mode == "shape" else None)
-    return replace(refined, tracks=tracks, shapes=dict.fromkeys(tracks, shown))
+    if len(seen) >= 2 and run.config.cycle.start != "shape":  # else the shape holds them together
+        redrawn = {t: drawn_images(run, drawn[t], shape, images[t]) for t in images}
+        tracks |= dict.fromkeys(seen, register(run, seen, redrawn, together=True))
+    return Again(drawn, tracks)
+
+
+def second_pass(run: Run, refined: Pass, images: Mapping[int, Images], name: str, icp: bool) -> Pass:
+    """Vision once more."""
+    again = tracked_again(run, refined, images, name, icp)
+    shown = again.shape(run, name, refined.shape, images)
+    return replace(refined, tracks=again.tracks, shapes=dict.fromkeys(again.tracks, shown))
 
 
 def judged_pass(
-    run: Run, before: Pass, refined: Pass, images: Mapping[int, Images], name: str, icp: bool
+    run: Run, before: Pass, refined: Pass, halves: Sequence[Half], images: Mapping[int, Images], name: str, icp: bool
 ) -> tuple[Pass, Losses]:
     """The second pass, and the contact losses per toss (J) before and after it, each toss judged by the half that did
     not learn from it: what contact corrects of the half's shape goes through the second pass as the row's does."""
-    after = second_pass(run, refined, images, name, icp)
-    halves = [replace(h, contact=learn_contact(run, f"{name}, {h.name}", {t: before.tracks[t] for t in h.learned_from},
-                                               h.shape)) for h in before.halves]  # fmt: skip
-    if any(h.contact is None or h.contact.result.kept_out for h in halves):  # one alone would not judge both ways
-        halves = []
-    drawn = reproject(run, name, refined.tracks, refined.shape, images, icp)
-    ended = []
-    for half in halves:
-        shape = after.shape
-        if refined.shape.key != before.shape.key and half.contact is not None:  # contact's shape was not kept out
-            redrawn = {t: drawn_images(run, drawn, half.contact, images[t]) for t in images}
-            believed = half.contact if run.config.cycle.start == "shape" else None
-            shape = learn_field(run, f"{name}, {half.name}, second pass", after.tracks, redrawn, believed)
-        ended.append(replace(half, shape=shape))
-    losses = tuple(losses_of([judge_by_contact(run, name, x.tracks, h) for h in of])
-                   for x, of in ((before, halves), (after, ended)))  # fmt: skip
-    return replace(after, halves=tuple(ended)), (losses[0], losses[1])
+    again = tracked_again(run, refined, images, name, icp)
+    corrected = refined.shape.key != before.shape.key  # else contact's shape was kept out
+
+    def shape(k: int) -> Done:
+        half = None if k < 0 else halves[k]
+        if half is None or half.contact is None or not corrected:
+            return again.shape(run, name, refined.shape, images)
+        return again.shape(run, f"{name}, {half.name}", half.contact, images)
+
+    shapes = each(run, range(-1, len(halves)), shape)
+    after = replace(refined, tracks=again.tracks, shapes=dict.fromkeys(again.tracks, shapes[-1]),
+                    halves=tuple(replace(h, shape=shapes[k]) for k, h in enumerate(halves)))  # fmt: skip
+    judging = [(before, h) for h in halves] + [(after, h) for h in after.halves]
+    judged = each(run, range(len(judging)), lambda k: judge_by_contact(run, name, judging[k][0].tracks, judging[k][1]))
+    losses = [losses_of([judged[k] for k in range(len(judging)) if judging[k][0] is x]) for x in (before, after)]
+    return after, (losses[0], losses[1])
 
 
 def compared(
     run: Run, before: Pass, after: Pass, images: Mapping[int, Images], name: str, losses: Losses
 ) -> dict[str, Any]:
     """See `passes.comparison`; on the raw images."""
-    first, second = (judge(run, name, x.tracks, x.shapes, images) for x in (before, after))
-    return comparison(before, after, (first, second), losses, name, run.config.cycle)
+    judged = both(run, *((lambda x=x: judge(run, name, x.tracks, x.shapes, images)) for x in (before, after)))
+    return comparison(before, after, judged, losses, name, run.config.cycle)
 
 
 def _until_converged(run: Run, second: Pass, images: Mapping[int, Images], name: str) -> Pass:
@@ -114,7 +157,8 @@ def _until_converged(run: Run, second: Pass, images: Mapping[int, Images], name:
     the best one is kept."""
     best, passes, most = second, list(second.passes), run.config.cycle.most_passes
     for number in range(3, 3 + most):
-        after, losses = judged_pass(run, best, with_contact(run, best, images, name), images, name, icp=True)
+        refined, halves = learned_from(run, best, images, name, contact=True)
+        after, losses = judged_pass(run, best, refined, halves, images, name, icp=True)
         told = {"pass": number, **compared(run, best, after, images, name, losses)}
         passes.append(told)
         if told["worse_share"] <= 0:

@@ -75,11 +75,11 @@ def every_frame(run: Run, toss: int, rig: Done) -> RgbdFrames:
 
 
 def track_and_image_keys(tracks: Mapping[int, Done], images: Mapping[int, Images]) -> dict[str, str]:
-    """`track_XX` and what the images of that toss are made from: of each toss its own (`masks_XX`), and what all share
-    (`drawn`, `shape`)."""
+    """`track_XX` and what that toss's images are made from: its own (`masks_XX`, `drawn_XX`), and what all share
+    (`shape`)."""
     found: dict[str, str] = {}
     for toss, done in tracks.items():
         found[f"track_{toss:02d}"] = done.key
         for name, key in images[toss].inputs.items():
-            found[f"masks_{toss:02d}" if name == "masks" else name] = key
+            found[f"{name}_{toss:02d}" if name in ("masks", "drawn") else name] = key
     return found

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from processing.images import Images
-from processing.run import Run
+from processing.run import Run, each
 from processing.stages.fuse import fuse_frames
 from processing.stages.judge import judge, residuals
 from processing.store import Done
@@ -46,7 +46,7 @@ def _unexplained(
     odd = [t for t in tosses if left[t] > limit]
     if not odd:
         return []
-    alone = _left(run, together, {t: fuse_frames(run, together, images, [t]) for t in odd}, images)
+    alone = _left(run, together, each(run, odd, lambda t: fuse_frames(run, together, images, [t])), images)
     return [t for t in odd if left[t] > alone[t] + 0.5 * limit]
 
 

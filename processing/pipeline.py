@@ -1,5 +1,5 @@
-"""The pipeline on one screen: plain calls of stages, each of which is read where it is there and computed where not.
-Scores come afterwards; what the ground truth says is never asked here (see evaluate/truth.py)."""
+"""The pipeline on one screen: plain calls of stages, each of which is read where it is there and computed where not;
+`each` makes its calls side by side. Scores come afterwards; the ground truth is never asked (see evaluate/truth.py)."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from processing.images import Images, every_frame, raw_images
 from processing.one_shape import kept_apart
 from processing.passes import Pass
 from processing.record import write_record
-from processing.run import Run
+from processing.run import Run, each
 from processing.stages.baseline import track_to_model
 from processing.stages.field import learn_field
 from processing.stages.find import find_object
@@ -39,14 +39,14 @@ def process(run: Run, variant: Variant, scope: Scope, model: Path | None = None)
     scene = learn_static_scene(run)
     rig = refine_rig(run, scene)
     found = find_object(run, scene, rig)
-    masks = {t: segment(run, t, scene, rig, found) for t in run.tosses}
+    masks = each(run, run.tosses, lambda t: segment(run, t, scene, rig, found))
     run = without_lost(run, masks)
     images = {t: raw_images(run, t, rig, masks[t]) for t in run.tosses}
     if model is not None:
         last = with_model(run, images, model)
     else:
         follow = track_to_model if run.tracker == FrameToModel.name else track
-        alone = {t: follow(run, images[t]) for t in run.tosses}  # p_i
+        alone = each(run, run.tosses, lambda t: follow(run, images[t]))  # p_i
         last = one_by_one(run, alone, images, scope) if variant.first == "one_toss" else (
             together(run, variant, scope, alone, images))  # fmt: skip
     lost = {t: lose(run, t, masks[t]) for t in run.lost}
@@ -56,7 +56,7 @@ def process(run: Run, variant: Variant, scope: Scope, model: Path | None = None)
 def with_model(run: Run, images: Mapping[int, Images], model: Path) -> Pass:
     """Every toss in the learned shape's object frame."""
     shape = bring_model(run, model)
-    tracks = {t: track(run, images[t], shape) for t in run.tosses}
+    tracks = each(run, run.tosses, lambda t: track(run, images[t], shape))
     return Pass(tracks, dict.fromkeys(run.tosses, shape), shared_frame=True, warnings=say.of_tracks(tracks),
                 notes=(f"shape: {model.name}",))  # fmt: skip
 
@@ -67,7 +67,7 @@ def one_by_one(run: Run, alone: Mapping[int, Done], images: Mapping[int, Images]
     if run.tracker == FrameToModel.name:
         return Pass(alone, alone, shared_frame=False, warnings=warnings, notes=notes)
     wanted = run.tosses if scope == "one" else run.tosses[:1]
-    shapes = {t: learn_field(run, f"toss {t}", {t: alone[t]}, images) for t in wanted}
+    shapes = each(run, wanted, lambda t: learn_field(run, f"toss {t}", {t: alone[t]}, images))
     whose = {t: shapes.get(t, shapes[wanted[0]]) for t in run.tosses}
     return Pass(alone, whose, shared_frame=False, warnings=warnings, notes=notes)
 
@@ -83,10 +83,10 @@ def together(run: Run, variant: Variant, scope: Scope, alone: Mapping[int, Done]
             last = replace(last, rollout=None if rolled.result.kept_out else rolled,
                            warnings=(*last.warnings, *say.no_rollouts(rolled)))  # fmt: skip
     elif variant.refined is not None:
-        starts = {t: start_alone(run, t, first, alone[t], images) for t in first.tracks}
-        last = Pass.joined([run_cycle(run, variant, s, images, f"toss {t}") for t, s in starts.items()])
+        last = Pass.joined([*each(run, first.tracks, lambda t: run_cycle(
+            run, variant, start_alone(run, t, first, alone[t], images), images, f"toss {t}")).values()])  # fmt: skip
     apart = {t: alone[t] for t in run.tosses if t not in last.tracks}  # in their own object frames
-    shapes = {t: learn_field(run, f"toss {t}", {t: alone[t]}, images) for t in apart}
+    shapes = each(run, apart, lambda t: learn_field(run, f"toss {t}", {t: alone[t]}, images))
     return replace(last, tracks={**last.tracks, **apart}, shapes={**last.shapes, **shapes},
                    shared_frame=last.shared_frame and not apart)  # fmt: skip
 

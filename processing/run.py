@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Hashable, Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeVar
 
 from processing.backends import settings_of
 from processing.config import Config
@@ -19,6 +19,10 @@ from recordings.session import Session
 CAMERA = "d455"
 """The camera that everything is tracked in."""
 MakeProgress = Callable[[str], Progress]
+Item = TypeVar("Item", bound=Hashable)
+Found = TypeVar("Found")
+First = TypeVar("First")
+Second = TypeVar("Second")
 
 
 @dataclass(frozen=True)
@@ -79,3 +83,14 @@ def toss_keys(run: Run, toss: int) -> dict[str, str]:
 def matcher_settings(run: Run, config: Any) -> dict[str, Any]:
     """The settings of a stage that matches features: its own, and the matcher where it is not the default."""
     return {**plain(config), **settings_of(run.config.backends.matcher, run.config.backends)}
+
+
+def each(run: Run, items: Iterable[Item], call: Callable[[Item], Found]) -> dict[Item, Found]:
+    """The call of every item, side by side where the run may: none of them needs what another one makes."""
+    return run.store.engine.each(items, call)
+
+
+def both(run: Run, first: Callable[[], First], second: Callable[[], Second]) -> tuple[First, Second]:
+    """Two calls side by side, neither of which needs what the other one makes."""
+    found: dict[int, Any] = run.store.engine.each((0, 1), lambda k: (first, second)[k]())
+    return found[0], found[1]

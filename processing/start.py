@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from processing.config import Config
+from processing.engine.each import Engine
 from processing.run import CAMERA, MakeProgress, Run
 from processing.segment.background.static_scene import StaticScene
 from processing.sensor.table_plane import with_table_from_depth
@@ -29,8 +30,10 @@ def start_run(
     tracker: str,
     progress: MakeProgress,
     device: str = "cpu",
+    engine: Engine | None = None,
 ) -> Run:
-    """The run of these tosses into a results folder. Raises BadInput where the session lacks what vision needs."""
+    """The run of these tosses into a results folder, its stages computed by `engine` (here, in turn). Raises BadInput
+    where the session lacks what vision needs."""
     if not tosses:
         raise BadInput(f"{session.path} has no tosses; wanted a session with toss_00.mcap and so on")
     if CAMERA not in session.calibration.cameras:
@@ -41,7 +44,7 @@ def start_run(
     keys = {f"toss_{t:02d}": file_sha256(session.file(t)) for t in tosses}
     physics = json.dumps(session.start.get("object"), sort_keys=True, default=str).encode()
     keys |= {"calibration": _calibration_key(session), "physics": hashlib.sha256(physics).hexdigest()}
-    return without_waiting(Run(session, tuple(tosses), Store(results), config, tracker, device, progress, keys))
+    return without_waiting(Run(session, tuple(tosses), Store(results, engine), config, tracker, device, progress, keys))
 
 
 def with_table(run: Run) -> Run:

@@ -15,16 +15,20 @@ import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, is_dataclass
+from dataclasses import asdict, dataclass, is_dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
+from processing.engine.each import Engine, InTurn, Task
 from recordings.bounded.documents import read_json
 from recordings.errors import BadInput, WriteFailed
 
 Result = TypeVar("Result")
 """A frozen dataclass of plain values: what a stage counted and decided, kept in its stage.json."""
 NO_SPACE = (errno.ENOSPC, errno.EDQUOT)
+HALF = ".partial"
+"""What the folder of a stage that is being computed ends with."""
 SHOWN = 8
 """Characters of the key in a folder's name."""
 
@@ -56,10 +60,11 @@ def plain(config: Any) -> Any:
 
 
 class Store:
-    """A results folder in which stages are run or found."""
+    """A results folder in which stages are run or found; by `engine` they run here, or side by side elsewhere."""
 
-    def __init__(self, results: Path) -> None:
+    def __init__(self, results: Path, engine: Engine | None = None) -> None:
         self.results = results
+        self.engine: Engine = engine if engine is not None else InTurn()
         with _spoken(results):
             try:
                 results.mkdir(parents=True, exist_ok=True)
@@ -70,6 +75,9 @@ class Store:
                 raise BadInput(f"{results} cannot be made ({reason}); choose another place with --out DIR") from refused
             if not os.access(results, os.W_OK):
                 raise BadInput(f"{results} cannot be written to; choose another place with --out DIR")
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {"results": self.results, "engine": InTurn()}  # where a stage is computed, no other is sent on
 
     def run(
         self,
@@ -89,40 +97,54 @@ class Store:
         folder = self.results / f"{stage}-{key[:SHOWN]}"
         if (found := _finished(folder, key, kind)) is not None:
             return found
-        with _spoken(self.results), locked(self.results / f".{folder.name}.lock"):
-            if (found := _finished(folder, key, kind)) is not None:  # made by another run while this one waited
-                return found
-            partial = folder.with_name(folder.name + ".partial")
-            shutil.rmtree(partial, ignore_errors=True)  # of a run that was killed: the lock says that it is gone
-            partial.mkdir()
-            try:
-                result = _timed(partial, compute, {"stage": stage, "version": version, "key": key}, config, inputs)
-                partial.rename(folder)
-            except BaseException:
-                shutil.rmtree(partial, ignore_errors=True)
-                raise
-        return Done(folder, key, result, reused=False)
+        about = {"stage": stage, "version": version, "key": key, "config": plain(config), "inputs": dict(inputs)}
+        self.engine.run(Task(str(folder), partial(_make, folder, about, compute), partial(_clear, folder)))
+        made = _finished(folder, key, kind)
+        if made is None:
+            raise WriteFailed(f"{folder} is not there, although its stage has ended; was it removed? Run again")
+        return replace(made, reused=False)
 
 
-def _timed(
-    partial: Path, compute: Callable[[Path], Result], about: Mapping[str, Any], config: Any, inputs: Mapping[str, str]
-) -> Result:
+def _make(folder: Path, about: Mapping[str, Any], compute: Callable[[Path], Any]) -> None:
+    """Compute a stage, unless another run made it while this one waited for the lock."""
+    half = folder.with_name(folder.name + HALF)
+    with _spoken(folder.parent), locked(_lock_of(folder)):
+        if (folder / "stage.json").exists():
+            return
+        shutil.rmtree(half, ignore_errors=True)  # of a run that was killed: the lock says that it is gone
+        half.mkdir()
+        try:
+            _timed(half, compute, about)
+            half.rename(folder)
+        except BaseException:
+            shutil.rmtree(half, ignore_errors=True)
+            raise
+
+
+def _clear(folder: Path) -> None:
+    """What a process that was killed left of a stage."""
+    with locked(_lock_of(folder)):
+        shutil.rmtree(folder.with_name(folder.name + HALF), ignore_errors=True)
+
+
+def _lock_of(folder: Path) -> Path:
+    return folder.with_name(f".{folder.name}.lock")
+
+
+def _timed(half: Path, compute: Callable[[Path], Any], about: Mapping[str, Any]) -> None:
     """Compute, then write stage.json with what it took; stage.json last, so that it marks a whole stage."""
     wall, cpu = time.monotonic(), time.process_time()
-    result = compute(partial)
+    result = compute(half)
     document = {
         **about,
-        "config": plain(config),
-        "inputs": dict(inputs),
         "seconds": round(time.monotonic() - wall, 3),
         "cpu_seconds": round(time.process_time() - cpu, 3),
         "counts": plain(result),
     }
-    with open(partial / "stage.json", "w") as out:
+    with open(half / "stage.json", "w") as out:
         json.dump(document, out, indent=1)
         out.flush()
         os.fsync(out.fileno())
-    return result
 
 
 def _finished(folder: Path, key: str, kind: type[Result]) -> Done[Result] | None:

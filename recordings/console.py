@@ -27,7 +27,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from recordings.errors import TosslabError
-from recordings.progress import Console, Log, Progress
+from recordings.progress import Board, Console, Log, Progress
 from recordings.system_libraries import advice
 
 DONE, FELL_SHORT, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
@@ -143,6 +143,11 @@ def _versions(prog: str) -> Outcome:
 def progress_for(label: str) -> Progress:
     """Progress on stderr, shown when the work takes over two seconds."""
     return Console(label, log=_log)
+
+
+def shared_board() -> Board:
+    """The same for works that go on side by side."""
+    return Board(log=_log)
 
 
 @contextlib.contextmanager

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import sys
+import threading
 import time
+from collections.abc import Hashable
 from typing import Protocol, runtime_checkable
 
 
@@ -106,47 +108,111 @@ def _seconds_each(first: tuple[float, int], last: tuple[float, int]) -> float:
     return (last[0] - first[0]) / (last[1] - first[1])
 
 
-class Console:
-    """One line on stderr with an estimate, shown only when the work takes over two seconds. On a terminal it is written
-    over; elsewhere `log` says when there may be another."""
+class Line:
+    """One line on stderr, shown only when the work takes over two seconds. On a terminal it is written over; elsewhere
+    `log` says when there may be another."""
 
     FIRST_SHOWN_S = 2.0
     EVERY_S = 0.2
 
-    def __init__(self, label: str, stream: Stream | None = None, log: Log | None = None) -> None:
-        self._label = label
+    def __init__(self, stream: Stream | None = None, log: Log | None = None) -> None:
         self._stream: Stream = stream if stream is not None else sys.stderr
         self._log = None if self._stream.isatty() else log or Log()
-        self._started_s = time.monotonic()
-        self._shown_s: float | None = None
-        self._ended = False
-        self._pace = Pace()
+        self.begin(time.monotonic())
 
-    def step(self, done: int, total: int, note: str = "") -> None:
-        now = time.monotonic()
-        self._pace.report(now, done, total)
-        elapsed, last = now - self._started_s, done >= total
-        if elapsed < self.FIRST_SHOWN_S or (last and self._ended) or not self._due(now, last):
+    def begin(self, now_s: float) -> None:
+        """Other work begins."""
+        self._started_s, self._shown_s, self._ended = now_s, -float("inf"), False
+
+    def show(self, text: str, now_s: float, left_s: float | None, last: bool) -> None:
+        """The text, with the seconds since the work began and those left, where it may be shown now."""
+        elapsed_s = now_s - self._started_s
+        if elapsed_s < self.FIRST_SHOWN_S or (last and self._ended) or not self._due(now_s, last):
             return
-        self._shown_s, left_s = now, None if last else self._pace.left_s(now)
-        note, left = f" {note}" if note else "", "" if left_s is None else f", about {_words(left_s)} left"
-        self._write(f"{self._label}: {done}/{total}{note} ({_words(elapsed)}{left})", last)
+        self._shown_s, self._ended = now_s, last
+        left = "" if left_s is None else f", about {_words(left_s)} left"
+        self._write(f"{text} ({_words(elapsed_s)}{left})", last)
 
-    def value(self, name: str, value: float, *, at: int) -> None:
-        pass
+    def clear(self) -> None:
+        """Nothing goes on any more: a terminal's line is free for others."""
+        if self._log is None and self._shown_s > self._started_s and not self._ended:
+            self._write("", last=False)
 
-    def _due(self, now: float, last: bool) -> bool:
+    def _due(self, now_s: float, last: bool) -> bool:
         if self._log is not None:
-            return self._log.due(now)
-        return last or self._shown_s is None or now - self._shown_s >= self.EVERY_S
+            return self._log.due(now_s)
+        return last or now_s - self._shown_s >= self.EVERY_S
 
     def _write(self, text: str, last: bool) -> None:
         if self._log is not None:
             self._stream.write(f"{text}\n")
         else:
             self._stream.write(f"\r\x1b[K{text}" + ("\n" if last else ""))
-        self._ended = last
         self._stream.flush()
+
+
+class Console:
+    """One line with an estimate, of one work at a time."""
+
+    def __init__(self, label: str, stream: Stream | None = None, log: Log | None = None) -> None:
+        self._label = label
+        self._line = Line(stream, log)
+        self._pace = Pace()
+
+    def step(self, done: int, total: int, note: str = "") -> None:
+        now, last = time.monotonic(), done >= total
+        self._pace.report(now, done, total)
+        text = f"{self._label}: {done}/{total}{f' {note}' if note else ''}"
+        self._line.show(text, now, None if last else self._pace.left_s(now), last)
+
+    def value(self, name: str, value: float, *, at: int) -> None:
+        pass
+
+
+class Board:
+    """One line for all works that go on side by side, with one estimate for them and those that wait for their turn.
+
+    A work is told by whom it is done (anything that can be a key), so that one that ends makes room for the next.
+    """
+
+    SHARE = 1000
+    """Parts that each work is counted in."""
+
+    def __init__(self, stream: Stream | None = None, log: Log | None = None) -> None:
+        self._line, self._pace = Line(stream, log), Pace()
+        self._going: dict[Hashable, tuple[str, int, int]] = {}
+        self._ended, self._waiting = 0, 0
+        self._lock = threading.Lock()
+
+    def waiting(self, count: int) -> None:
+        """So many works wait for their turn."""
+        with self._lock:
+            self._waiting = count
+
+    def step(self, who: Hashable, label: str, done: int, total: int, note: str = "") -> None:
+        """How far one of the works is."""
+        with self._lock:
+            now = time.monotonic()
+            if not self._going and not self._ended:
+                self._line.begin(now)
+            self._going[who] = (label, done, total)
+            self._show(now)
+
+    def ended(self, who: Hashable) -> None:
+        """One of the works has ended, told of or not."""
+        with self._lock:
+            self._ended += self._going.pop(who, None) is not None
+            if not self._going and not self._waiting:
+                self._ended, self._pace = 0, Pace()
+                self._line.clear()
+
+    def _show(self, now_s: float) -> None:
+        whole = self._ended + len(self._going) + self._waiting
+        done = self._ended + sum(done / max(total, 1) for _, done, total in self._going.values())
+        self._pace.report(now_s, int(self.SHARE * done), self.SHARE * whole)
+        works = [f"{label}: {done}/{total}" for label, done, total in self._going.values()]
+        more = [f"{self._waiting} more wait"] if self._waiting else []
+        self._line.show(" | ".join([*works, *more]), now_s, self._pace.left_s(now_s), last=False)
 
 
 def _words(seconds: float) -> str:

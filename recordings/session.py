@@ -122,6 +122,9 @@ class Toss:
         self.info = _own_metadata(self.file)
         self.index = whole_number(self.info.get("toss", 0), f"{path}: its toss number")
 
+    def __reduce__(self) -> tuple[type[Toss], tuple[Path]]:
+        return Toss, (self.path,)  # another process opens it anew
+
     def __enter__(self) -> Toss:
         return self
 
@@ -269,6 +272,9 @@ class Session:
         self._files = files
         self._open: dict[int, Toss] = {}
 
+    def __getstate__(self) -> dict[str, Any]:
+        return {**vars(self), "_open": {}}  # another process opens its files anew
+
     def __enter__(self) -> Session:
         return self
 
@@ -313,7 +319,9 @@ class Session:
 
     def toss(self, toss: int) -> Toss:
         if toss not in self._open:
-            self._open[toss] = Toss(self.file(toss))
+            opened = Toss(self.file(toss))
+            if self._open.setdefault(toss, opened) is not opened:  # another thread was faster
+                opened.close()
         return self._open[toss]
 
     def close(self) -> None:

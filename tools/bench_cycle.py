@@ -2,8 +2,12 @@
 
 python tools/bench_cycle.py                         # cube_dev: every row in scope all, then 2 and 5 tosses of `ours`
 python tools/bench_cycle.py --rows ours SESSION... --truth DIR...
+python tools/bench_cycle.py --jobs 1,2 SESSION...   # `ours` with one and with two stages at a time: how much faster
+python tools/bench_cycle.py --read RESULTS...       # what is there already: how much faster it could have been
 
-One thread; CPU time, not wall time. Peak memory is that of this process.
+CPU time, not wall time, except with --jobs, which wants a machine that has nothing else to do. What stages could reach
+side by side is told from the seconds and inputs that they left: `lanes` plays them through. Peak memory is that of the
+largest process.
 """
 
 from __future__ import annotations
@@ -11,10 +15,13 @@ from __future__ import annotations
 import argparse
 import os
 import resource
+import subprocess
 import sys
 import tempfile
-from collections.abc import Sequence
+import time
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
@@ -40,15 +47,26 @@ def main() -> int:
     parser.add_argument("--truth", nargs="*", type=Path, default=[], help="one for each session")
     parser.add_argument("--rows", default=",".join(v.name for v in (*TABLE, *BEYOND)))
     parser.add_argument("--scope", choices=("one", "all"), default="all")
+    parser.add_argument("--jobs", help="stages at a time to compare, for example 1,2")
+    parser.add_argument("--read", nargs="+", type=Path, default=[], help="results folders that are there already")
     parser.add_argument("--keep", type=Path, help="keep the results here, and go on from what is there")
     given = parser.parse_args()
+    for results in given.read:
+        print(f"== {results}")
+        stages(results)
+    if given.read:
+        return 0
     sessions = given.sessions or [DATA / "cube_dev"]
     truths = given.truth or [s.with_name(f"{s.name}_truth") for s in sessions]
     with tempfile.TemporaryDirectory() as place:
         root = given.keep or Path(place)
         for session, truth in zip(sessions, truths, strict=True):
+            if given.jobs:
+                side_by_side(opened(session, root), root, [int(n) for n in given.jobs.split(",")])
+                continue
             bench(opened(session, root), truth, root / f"{session.name}_results", given.rows.split(","), given.scope)
-    print(f"peak memory {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6:.2f} GB")
+    largest = max(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    print(f"peak memory {largest / 1e6:.2f} GB")
     return 0
 
 
@@ -76,6 +94,18 @@ def bench(session: Session, truth: Path, out: Path, rows: Sequence[str], scope: 
                 few = out.with_name(f"{out.name}_{count}")
                 run_row(session, session.tosses[:count], truth, few, "ours", scope)
                 stages(few)
+
+
+def side_by_side(session: Session, root: Path, jobs: Sequence[int]) -> None:
+    """`ours` by command, anew with each number of jobs: wall seconds, and how much faster than the first."""
+    code, took = "import sys; from processing.cli import main; sys.exit(main())", []
+    for n in jobs:
+        out, begun = root / f"{session.name}_jobs_{n}", time.monotonic()
+        command = [sys.executable, "-c", code, str(session.path), "--jobs", str(n), "--out", str(out)]
+        subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+        took.append(time.monotonic() - begun)
+        print(f"{session.name}: --jobs {n}: {took[-1]:.0f} s, {took[0] / took[-1]:.2f} times as fast as {jobs[0]}")
+        stages(out)
 
 
 def run_row(session: Session, tosses: Sequence[int], truth: Path, out: Path, name: str, scope: str) -> None:
@@ -108,13 +138,36 @@ def worst(score: VariantScore) -> str:
 
 
 def stages(out: Path) -> None:
-    """CPU seconds of every stage, and their sum."""
+    """CPU seconds of every stage, their sum, and what they could take side by side."""
     results = Results.open(out)
     spent: dict[str, float] = {}
-    for folder in sorted(p.parent.name for p in out.glob("*/stage.json")):
-        document = results.stage(folder)
+    documents = [results.stage(name) for name in sorted(p.parent.name for p in out.glob("*/stage.json"))]
+    for document in documents:
         spent[document["stage"]] = spent.get(document["stage"], 0.0) + float(document["cpu_seconds"])
-    print("   CPU-s " + ", ".join(f"{k} {v:.0f}" for k, v in spent.items()) + f"; all {sum(spent.values()):.0f}")
+    whole = sum(spent.values())
+    print("   CPU-s " + ", ".join(f"{k} {v:.0f}" for k, v in spent.items()) + f"; all {whole:.0f}")
+    for count in (2, 4, len(documents)):
+        name = f"{count} lanes" if count < len(documents) else "any number"
+        print(f"   on {name}: {(took := lanes(documents, count)):.0f} s, {whole / took:.2f} times as fast as on one")
+
+
+def lanes(documents: Sequence[Mapping[str, Any]], count: int) -> float:
+    """Seconds that the stages take on so many lanes, each begun when all that it reads is there, first come first
+    served. What the pipeline decides between stages is taken to need the stages that it compares."""
+    keys = {d["key"] for d in documents}
+    waits = {d["key"]: {k for k in d["inputs"].values() if k in keys} for d in documents}
+    cost = {d["key"]: float(d["cpu_seconds"]) for d in documents}
+    ended: dict[str, float] = {}
+    free = [0.0] * count
+    while waits:
+        ready = {
+            k: max((ended[x] for x in needed), default=0.0) for k, needed in waits.items() if needed <= ended.keys()
+        }
+        lane = min(range(count), key=lambda i: free[i])
+        key = min(ready, key=lambda k: (max(ready[k], free[lane]), ready[k], -cost[k]))
+        free[lane] = ended[key] = max(ready[key], free[lane]) + cost[key]
+        del waits[key]
+    return max(ended.values())
 
 
 if __name__ == "__main__":

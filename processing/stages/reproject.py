@@ -1,5 +1,5 @@
-"""Stage `reproject` (the paper's steps 4 and 5): the poses at which the shape is drawn into the images, laid onto raw
-depth first where wanted, and the masks M' (M'') there."""
+"""Stage `reproject` (the paper's steps 4 and 5) of one toss: the poses at which the shape is drawn into its images,
+laid onto raw depth first where wanted, and the masks M' (M'') there."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from processing.store import Done
 from recordings.results.folder import read_shape, read_track, write_masks, write_track
 from recordings.tracks import ObjectShape, ObjectTrack
 
-VERSION = 4
+VERSION = 5
 
 
 @dataclass(frozen=True)
@@ -30,28 +30,23 @@ class ReprojectResult:
     icp: Mapping[str, int]
 
 
-def reproject(
-    run: Run, name: str, tracks: Mapping[int, Done], shape: Done, images: Mapping[int, Images], icp: bool
-) -> Done[ReprojectResult]:
-    """With `icp` the shape is first laid onto the raw depth of every frame; a rejected frame keeps its pose, and is
-    counted. Depth is compared at its own exposure time, the pose is corrected at both."""
-    inputs = {**track_and_image_keys(tracks, images), "shape": shape.key}
-    cycle = run.config.cycle
+def reproject(run: Run, name: str, track: Done, shape: Done, raw: Images, icp: bool) -> Done[ReprojectResult]:
+    """One toss. With `icp` the shape is first laid onto the raw depth of every frame; a rejected frame keeps its pose,
+    and is counted. Depth is compared at its own exposure time, the pose is corrected at both."""
+    toss, cycle = raw.toss, run.config.cycle
+    inputs = {**track_and_image_keys({toss: track}, {toss: raw}), "shape": shape.key}
     config = {"icp": vars(cycle.icp) if icp else None, "redraw": vars(cycle.redraw), "renderer": cycle.renderer}
 
     def compute(folder: Path) -> ReprojectResult:
-        body, progress = read_shape(shape.folder), run.progress(f"{name}: reprojection")
-        total: dict[str, int] = {}
-        for done, toss in enumerate(tracks):
-            progress.step(done, len(tracks), f"toss {toss}")
-            track, seen = read_track(tracks[toss].folder, toss), images[toss].open()
-            if icp:
-                track, counts, details = _laid_on_depth(run, track, body, seen)
-                total = {k: total.get(k, 0) + counts.get(k, 0) for k in (*total, *counts)}
-                np.savez(folder / f"toss_{toss:02d}.icp.npz", **details)
-            write_track(folder, track)
-            write_masks(folder, toss, _drawn(run, track, body, seen).masks, seen.confidence)
-        return ReprojectResult(total)
+        run.progress(f"{name}: reprojection").step(0, 1, f"toss {toss}")
+        body, poses, seen = read_shape(shape.folder), read_track(track.folder, toss), raw.open()
+        counts: dict[str, int] = {}
+        if icp:
+            poses, counts, details = _laid_on_depth(run, poses, body, seen)
+            np.savez(folder / f"toss_{toss:02d}.icp.npz", **details)
+        write_track(folder, poses)
+        write_masks(folder, toss, _drawn(run, poses, body, seen).masks, seen.confidence)
+        return ReprojectResult(counts)
 
     return run.store.run("reproject", VERSION, config, inputs, ReprojectResult, compute)
 

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool
 from numpy import ndarray as Array
 
-from processing.run import Run
+from processing.run import Run, each
 from processing.sensor.still import Kept, ThinnedSession, kept_of, still_stretches, whole_session
 from processing.store import Done
 from recordings.results.folder import RobotMasks, read_masks, read_track, write_masks, write_track
@@ -40,7 +40,7 @@ class EveryFrameResult:
 
 def without_waiting(run: Run) -> Run:
     """The run with few frames of every still stretch; the very same run where there is none."""
-    kept = {t: k for t in run.tosses if (k := _kept(run, t)) is not None}
+    kept = {t: k for t, k in each(run, run.tosses, lambda t: _kept(run, t)).items() if k is not None}
     if not kept:
         return run
     keys = {f"toss_{t:02d}": hashlib.sha256((run.keys[f"toss_{t:02d}"] + k.digest).encode()).hexdigest()

@@ -11,6 +11,7 @@ from numpy import ndarray as Array
 
 from recordings.geometry import CameraModel, Transform, quaternion_from_rotation, rotation_angle_rad
 from recordings.tracks import TagPlacement
+from recordings.view.body_point import at_same_point
 from recordings.view.layers import CAMERA, MOTION, Clock, Look, image_entity, plotted
 from recordings.view.mesh import outline_px, shaded_mesh
 from recordings.view.scene import Body, Color, Scene, root_poses
@@ -88,11 +89,12 @@ def log_bodies(recording: rr.RecordingStream, scene: Scene, toss: int) -> None:
     for body in scene.bodies:
         clock.at(start_ns).log(BODY.format(body.name), rr.Clear(recursive=True))
         times_ns, matrices = root_poses(scene, body.poses.get(toss, ()))
-        log_path(clock, body, start_ns, matrices)
+        followed = at_same_point(scene, body, toss, times_ns, matrices)
+        log_path(clock, body, start_ns, followed)
         if len(times_ns) == 0:
             continue
         log_poses(clock, scene, body, times_ns, matrices)
-        log_motion(clock, scene, body, times_ns, matrices)
+        log_motion(clock, scene, body, times_ns, followed)
         if body.shown:
             log_outlines(clock, scene, body, times_ns, matrices)
 
@@ -143,7 +145,7 @@ def guessed_half_m(scene: Scene, matrices: Float[Array, "n 4 4"]) -> float | Non
 
 
 def log_path(clock: Clock, body: Body, start_ns: int, matrices: Float[Array, "n 4 4"]) -> None:
-    """The way of the body's origin through the toss; broken where it was lost."""
+    """The way of the body's point that is followed through the toss; broken where it was lost."""
     strips = unbroken(matrices[:, :3, 3])
     clock.at(start_ns).log(PATH.format(body.name), rr.LineStrips3D(strips, colors=[body.color], radii=0.001))
 
@@ -156,7 +158,7 @@ def unbroken(points: Float[Array, "n 3"]) -> list[Float[Array, "m 3"]]:
 def log_motion(
     clock: Clock, scene: Scene, body: Body, times_ns: Int64[Array, " n"], matrices: Float[Array, "n 4 4"]
 ) -> None:
-    """Height over the table, speed and spin as plots; a lost frame leaves a gap."""
+    """Height over the table and speed of the point that is followed, and spin, as plots; a lost frame leaves a gap."""
     values = {"speed_m_s": speeds_m_s(times_ns, matrices), "spin_rad_s": spins_rad_s(times_ns, matrices)}
     if scene.root == "world":
         values["height_m"] = matrices[:, 2, 3]

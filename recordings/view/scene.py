@@ -28,6 +28,7 @@ POSES: Color = (60, 150, 255)
 GAP_BETWEEN_TOSSES_NS = 1_000_000_000
 """Tosses whose clocks overlap are laid out one after another, this far apart."""
 SHOWN_FIRST = ("ours", "converged", "joint", "no-icp", "no-contact", "no-cycle", "bundlesdf-10", "bundlesdf-1")
+TRUTH_NAME = "truth"
 POSE_SCHEMA = "foxglove.PoseInFrame"
 
 
@@ -267,7 +268,7 @@ def _truth_body(session: Session) -> list[Body]:
     if mesh.exists():
         shape = read_mesh(mesh, "object", "truth")
         shapes = dict.fromkeys(poses, shape)
-    return [Body("truth", "truth", TRUTH, poses, shapes)]
+    return [Body(TRUTH_NAME, TRUTH_NAME, TRUTH, poses, shapes)]
 
 
 def _root(calibration: RigCalibration, bodies: Sequence[Body]) -> str:

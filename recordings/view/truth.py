@@ -78,7 +78,7 @@ def log_cameras(clock: Clock, scene: Scene, cameras: dict[str, Any]) -> None:
 
 
 def log_path_sigma(clock: Clock, scene: Scene, data: dict[str, Array]) -> None:
-    """The body's uncertainty at every instant of the ground-truth cameras, along its path."""
+    """Uncertainty of the tagged frame's origin at every instant of the ground-truth cameras."""
     if len(data["track_time_ns"]) == 0:
         return
     start_ns = scene.spans_ns[clock.toss][0]

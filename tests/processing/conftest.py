@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -137,6 +137,14 @@ class TinyWorld:
             np.savez(folder / f"toss_{toss:02d}" / "poses_camera_object.npz", t=times_s, T_camera_object=poses)
         trimesh.creation.box(BOX_M).export(folder / "mesh.obj")
         return folder
+
+
+@pytest.fixture(autouse=True, scope="session")
+def stages_in_turn() -> Iterator[None]:
+    """Commands compute their stages in the test's own process, where a test can look into them."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("processing.engine.jobs.cores", lambda: 1)
+        yield
 
 
 @pytest.fixture(scope="session")

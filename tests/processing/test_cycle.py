@@ -233,7 +233,7 @@ def test_passes_go_on_while_the_raw_images_are_explained_better_and_the_best_is_
 
     judged = iter([0.001, -0.02, -0.01, 0.0005])
     monkeypatch.setattr(cycle, "compared", lambda *a, **k: {"of": "x", "worse_share": next(judged), "same": False})
-    monkeypatch.setattr(cycle, "with_contact", lambda run, best, images, name: best)
+    monkeypatch.setattr(cycle, "learned_from", lambda run, best, images, name, contact: (best, ()))
     count = iter(range(2, 9))
 
     def another(*_: Any, **__: Any) -> tuple[Pass, tuple[dict[int, float], dict[int, float]]]:

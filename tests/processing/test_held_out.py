@@ -11,7 +11,7 @@ import pytest
 import trimesh
 
 from processing.config import Config
-from processing.cycle import judged_pass, with_contact
+from processing.cycle import judged_pass, learned_from
 from processing.evaluate.truth import open_truth
 from processing.field.learn import LearnConfig
 from processing.field.train import FieldConfig
@@ -153,9 +153,9 @@ def test_no_contact_of_a_toss_is_in_the_second_pass_shape_that_it_is_judged_by(
     images = {t: raw_images(run, t, rig, segment(run, t, scene, rig, found)) for t in run.tosses}
     shapes = dict.fromkeys(true_tracks, true_shape)
     start = Pass(true_tracks, shapes, shared_frame=True, halves=halves_of(true_tracks, shapes))
-    refined = with_contact(run, start, images, "test")
+    refined, halves = learned_from(run, start, images, "test", contact=True)
     assert refined.shapes[0].key != true_shape.key, "contact's shape must take part, or nothing is shown"
-    after, losses = judged_pass(run, start, refined, images, "test", icp=False)
+    after, losses = judged_pass(run, start, refined, halves, images, "test", icp=False)
     assert [sorted(x) for x in losses] == [list(run.tosses)] * 2
     for half in after.halves:
         assert half.shape.key != after.shapes[0].key

@@ -130,3 +130,27 @@ def test_silent_is_silent(capsys):
     progress.Silent().step(1, 2)
     progress.Silent().value("loss", 1.0, at=3)
     assert capsys.readouterr() == ("", "")
+
+
+def test_works_side_by_side_share_a_line_and_an_estimate_for_all_that_wait(clock):
+    out = Terminal()
+    board = progress.Board(out)
+    board.waiting(2)
+    for done in range(1, 81):
+        clock[0] += 0.5
+        board.step("a", "toss 0: poses", done, 100)
+        board.step("b", "toss 1: poses", done, 100)
+    line = out.getvalue().split("\x1b[K")[-1]
+    assert line == "toss 0: poses: 80/100 | toss 1: poses: 79/100 | 2 more wait (40 s, about 60 s left)"
+
+
+def test_when_nothing_goes_on_any_more_the_terminals_line_is_free(clock):
+    out = Terminal()
+    board = progress.Board(out)
+    for done in range(1, 11):
+        clock[0] += 1
+        board.step("a", "toss 0: poses", done, 10)
+    board.ended("a")
+    assert out.getvalue().endswith("\r\x1b[K")
+    board.step("a", "toss 1: poses", 1, 10)
+    assert out.getvalue().endswith("\r\x1b[K")  # other work: quiet for two seconds again

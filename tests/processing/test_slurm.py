@@ -1,12 +1,10 @@
-"""Jobs in processes of their own: judged by their markers, the same here and on a Slurm cluster without accounting."""
+"""Stages as jobs of a Slurm cluster without accounting: judged by their markers, the same as in processes here."""
 
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import pwd
-import re
 import shutil
 import signal
 import socket
@@ -17,13 +15,16 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import cloudpickle
 import pytest
 
-from processing.executor import Task, run_all
-from recordings.progress import Silent
+from processing.engine.each import Engine, SideBySide
+from processing.engine.slurm import slurm_jobs
+from processing.engine.workers import Worker
+from processing.store import Store
+from recordings.errors import BadInput, TosslabError
+from recordings.progress import Board
 
 cloudpickle.register_pickle_by_value(sys.modules[__name__])  # a job's process cannot import a test
 
@@ -67,36 +68,50 @@ PartitionName=all Nodes={host} Default=YES MaxTime=INFINITE State=UP
 """
 
 
-def work(kind: str, folder: Path) -> dict[str, Any]:
+@dataclass(frozen=True)
+class Kind:
+    kind: str
+    numbers: tuple[float | None, ...]
+
+
+def stage(engine: Engine, folder: Path, kind: str) -> Kind | str:
     """`plain` gives a result, `dies` is killed, `fails` raises, `waits` waits where it is started for the first time
-    and there is a file `hang`."""
-    with open(folder / f"{kind}.starts", "a") as starts:
-        starts.write(f"{os.getpid()}\n")
-    if kind == "dies":
-        os.kill(os.getpid(), signal.SIGKILL)
-    if kind == "fails":
-        raise ValueError("two is not three")
-    if kind == "waits" and (folder / "hang").exists() and len((folder / f"{kind}.starts").read_text().split()) == 1:
-        time.sleep(600)
-    return {"kind": kind, "exit_code": 0, "numbers": [1.5, None]}
+    and there is a file `hang`. The stage's result, or what was raised."""
 
+    def compute(_: Path) -> Kind:
+        with open(folder / f"{kind}.starts", "a") as starts:
+            starts.write(f"{os.getpid()}\n")
+        if kind == "dies":
+            os.kill(os.getpid(), signal.SIGKILL)
+        if kind == "fails":
+            raise BadInput("two is not three")
+        if kind == "waits" and (folder / "hang").exists() and len((folder / f"{kind}.starts").read_text().split()) == 1:
+            time.sleep(600)
+        return Kind(kind, (1.5, None))
 
-def tasks(folder: Path, *kinds: str) -> list[Task]:
     folder.mkdir(exist_ok=True)
-    return [Task(kind, folder / "logs" / kind, (kind, folder)) for kind in kinds]
+    try:
+        return Store(folder / "results", engine).run(kind, 1, {}, {}, Kind, compute).result
+    except TosslabError as wrong:
+        return f"{type(wrong).__name__}: {wrong}"
 
 
-def without_logs(results: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Errors up to the log's last words, which name processes and places."""
-    return [{**r, "error": re.split(r" \(|;", r["error"])[0]} if "error" in r else r for r in results]
+def stages(engine: Engine, folder: Path, *kinds: str) -> list[Kind | str]:
+    return list(engine.each(kinds, lambda kind: stage(engine, folder, kind)).values())
 
 
-def test_a_job_that_is_killed_or_raises_is_an_error_and_stops_no_other(tmp_path):
-    results = run_all(work, tasks(tmp_path, "plain", "dies", "fails"), "local", Silent())
-    assert results[0] == {"kind": "plain", "exit_code": 0, "numbers": [1.5, None]}
-    assert results[1]["error"].startswith("the process ended without a result")
-    assert "two is not three" in results[2]["error"]
-    assert str(tmp_path / "logs" / "fails") in results[2]["error"]
+@contextlib.contextmanager
+def on_slurm(folder: Path) -> Iterator[SideBySide]:
+    board = Board()
+    with SideBySide(slurm_jobs(4, folder / "logs"), board) as engine:
+        yield engine
+
+
+@contextlib.contextmanager
+def here() -> Iterator[SideBySide]:
+    board = Board()
+    with SideBySide([Worker(board), Worker(board)], board) as engine:
+        yield engine
 
 
 @dataclass
@@ -243,20 +258,25 @@ def test_slurm_without_accounting_gives_what_local_gives_when_jobs_are_killed_an
     slurm: Slurm, tmp_path: Path, capfd: pytest.CaptureFixture
 ) -> None:
     assert "disabled" in slurm.say("sacct")  # the cluster that this is about
-    here = run_all(work, tasks(tmp_path / "here", "plain", "dies", "fails", "waits"), "local", Silent())
+    with here() as engine:
+        wanted = stages(engine, tmp_path / "here", "plain", "dies", "fails", "waits")
 
     there = tmp_path / "there"
-    asked = tasks(there, "plain", "dies", "fails")
+    there.mkdir()
     (there / "hang").touch()
-    found = run_all(work, asked, "slurm", Silent())
-    failing = threading.Thread(target=_fail_the_node, args=(slurm, there / "waits.starts"))
-    failing.start()
-    found += run_all(work, tasks(there, "waits"), "slurm", Silent())
-    failing.join()
+    with on_slurm(there) as engine:
+        found = stages(engine, there, "plain", "dies", "fails")
+        failing = threading.Thread(target=_fail_the_node, args=(slurm, there / "waits.starts"))
+        failing.start()
+        found += stages(engine, there, "waits")
+        failing.join()
 
     assert len((there / "waits.starts").read_text().split()) == 2  # it was queued again, and ran anew
-    assert without_logs(found) == without_logs(here)
-    assert json.dumps(found[2]).count("two is not three") == 1
+    assert [r if isinstance(r, Kind) else r.split(":")[0] for r in found] == [
+        r if isinstance(r, Kind) else r.split(":")[0] for r in wanted
+    ]
+    assert found[2] == "BadInput: two is not three"
+    assert sorted(p.name.split("-")[0] for p in (there / "results").iterdir()) == ["plain", "waits"]
     said = capfd.readouterr()
     assert "sacct" not in said.out + said.err
     assert "submitit" not in said.out + said.err
@@ -264,15 +284,25 @@ def test_slurm_without_accounting_gives_what_local_gives_when_jobs_are_killed_an
 
 @pytest.mark.slow
 def test_a_job_that_is_cancelled_on_slurm_ends_without_a_result(slurm: Slurm, tmp_path: Path) -> None:
-    asked = tasks(tmp_path / "there", "waits")
-    (tmp_path / "there" / "hang").touch()
+    there = tmp_path / "there"
+    there.mkdir()
+    (there / "hang").touch()
 
     def cancel() -> None:
-        slurm.wait_for((tmp_path / "there" / "waits.starts").exists)
+        slurm.wait_for((there / "waits.starts").exists)
         slurm.say("scancel", "--name=tosslab")
 
     cancelling = threading.Thread(target=cancel)
     cancelling.start()
-    found = run_all(work, asked, "slurm", Silent())
+    with on_slurm(there) as engine:
+        (found,) = stages(engine, there, "waits")
     cancelling.join()
-    assert found[0]["error"].startswith("the process ended without a result")
+    assert isinstance(found, str)
+    assert "ended without a result" in found
+    assert list((there / "results").iterdir()) == []
+
+
+def test_without_slurm_it_is_said_what_to_type(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(BadInput, match="--executor local"):
+        slurm_jobs(2, tmp_path)

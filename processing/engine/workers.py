@@ -1,0 +1,149 @@
+"""Lanes on this machine: processes that compute the stages they are sent, one at a time.
+
+A worker is begun when there is work for it. It takes no notice of Ctrl-C, which its parent hears; it ends when it is
+stopped, and by itself when its parent is gone, however that ended.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import sys
+import threading
+import time
+from multiprocessing.connection import Connection, wait
+from typing import Any
+
+from processing.engine.each import Task
+from processing.engine.outcome import Lost, Outcome, outcome_of
+from recordings.progress import Board, Progress, Silent
+
+PRELOADED = ["processing.pipeline"]
+"""Imported once, in the process that all workers are forked from (where there is such a one)."""
+TOLD_EVERY_S = 0.2
+
+
+class Worker:
+    """A process of our own; `board` shows how far its stage is."""
+
+    def __init__(self, board: Board) -> None:
+        self._board = board
+        self._process: Any = None
+        self._pipe: Connection | None = None
+        self._stopped = False
+
+    def perform(self, task: Task) -> Outcome:
+        import cloudpickle
+
+        pipe = self._begun()
+        try:
+            pipe.send_bytes(cloudpickle.dumps(task.call))
+            while True:
+                told = pipe.recv()
+                if isinstance(told, dict):
+                    return told
+                self._board.step(self, *told)
+        except (EOFError, OSError):
+            raise Lost(self._why(task)) from None
+        finally:
+            self._board.ended(self)
+
+    def stop(self) -> None:
+        self._stopped = True
+        if self._process is not None:
+            self._process.kill()
+
+    def _begun(self) -> Connection:
+        if self._stopped:
+            raise Lost("stopped")
+        if self._process is None:
+            context = _context()
+            self._pipe, theirs = context.Pipe()
+            self._process = context.Process(target=work, args=(theirs,), name="toss-process stages", daemon=True)
+            self._process.start()
+            theirs.close()
+        assert self._pipe is not None
+        return self._pipe
+
+    def _why(self, task: Task) -> str:
+        """What became of the process; another one takes its place where there is more to do."""
+        self._process.join()
+        code, self._process = self._process.exitcode, None
+        how = f"was killed ({signal.Signals(-code).name})" if code < 0 else f"ended with code {code}"
+        return (
+            f"the process that computed {os.path.basename(task.name)} {how}; where memory was short, take fewer at a "
+            "time: --jobs N. Every finished stage is kept: run the same command again, it goes on from there"
+        )
+
+
+def _context() -> Any:
+    """Workers are forked from a process that has imported everything and done nothing, where the system can."""
+    if not sys.platform.startswith("linux"):
+        return multiprocessing.get_context("spawn")
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(PRELOADED)
+    return context
+
+
+_to_parent: Connection | None = None
+"""In a worker: where to tell how far its stage is."""
+
+
+def work(pipe: Connection) -> None:
+    """What a worker does: computes what it is sent, until nothing is sent any more."""
+    import cloudpickle
+
+    global _to_parent
+    _to_parent = pipe
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    _quiet()
+    while True:
+        try:
+            call = pipe.recv_bytes()
+        except (EOFError, OSError):
+            return
+        pipe.send(outcome_of(lambda sent=call: cloudpickle.loads(sent)()))
+
+
+def _quiet() -> None:
+    """As in the command itself: what libraries warn their programmers of is not for a user; and one thread."""
+    import warnings
+
+    import cv2
+
+    cv2.setNumThreads(1)
+    if not sys.warnoptions:
+        warnings.simplefilter("ignore")
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        wait([parent.sentinel])
+        os.kill(os.getpid(), signal.SIGTERM)
+
+
+class _Told:
+    """A stage's progress in a worker, sent to where all of them are shown."""
+
+    def __init__(self, label: str) -> None:
+        self._label = label
+        self._told_s = -float("inf")
+
+    def step(self, done: int, total: int, note: str = "") -> None:
+        now = time.monotonic()
+        if _to_parent is not None and (now - self._told_s >= TOLD_EVERY_S or done >= total):
+            self._told_s = now
+            _to_parent.send((self._label, done, total, note))
+
+    def value(self, name: str, value: float, *, at: int) -> None:
+        pass
+
+
+class Shown:
+    """`run.progress` where stages are computed in lanes: sent to the board by the process that computes one."""
+
+    def __call__(self, label: str) -> Progress:
+        return Silent() if _to_parent is None else _Told(label)

@@ -1,0 +1,103 @@
+"""Compile every numba kernel for this machine ahead of its first use, side by side on all cores.
+
+python tools/compile_kernels.py                     # what `make setup` and `make demo` call; nothing is done twice
+
+numba keeps what it compiled beside the sources, or in the user's own cache where the package cannot be written to, by
+version of numba, content of the source and kind of CPU. What is not compiled here, or for other types, is compiled at
+its first use.
+"""
+
+from __future__ import annotations
+
+import argparse
+import multiprocessing
+import sys
+import time
+from importlib import import_module
+
+TRACK = "processing.track.kernels"
+PROFILE = "processing.track.revolution.profile_kernels"
+AZIMUTH = "processing.track.revolution.azimuth_kernels"
+F8, F4, I8 = "float64", "float32", "int64"
+V, M, T, Q = f"{F8}[::1]", f"{F8}[:,::1]", f"{F8}[:,:,::1]", f"{F8}[:,:,:,::1]"
+V4, M4, T4, Q4 = f"{F4}[::1]", f"{F4}[:,::1]", f"{F4}[:,:,::1]", f"{F4}[:,:,:,::1]"
+VI, MI, VB, MB = f"{I8}[::1]", f"{I8}[:,::1]", "boolean[::1]", "boolean[:,::1]"
+MOTION = (V, V, VB, V, V, V, F8, V)
+ROLL = (T, M, M, M, VI, M, M, M, F8, I8, I8, F8)
+KERNELS: dict[tuple[str, str], list[tuple[str, ...]]] = {
+    (TRACK, "align_view"): [(M, I8, VI, T, M4, M4, MI, V, V, M, V, M)],
+    (TRACK, "graph_terms"): [(T, MI, M4, M4, MI, V, V, V, T, M, M)],
+    (TRACK, "view_terms"): [(M, I8, VI, T, M4, M4, MI, V, V, V, M, V)],
+    (TRACK, "to_object"): [(M, V, M, F8, M, V)],
+    (PROFILE, "surface_terms"): [(M4, M, M, V, V, VB, VI, V, F8, F8, M, V, M, M, V)],
+    (PROFILE, "outline_terms"): [(V4, VI, V, V, M, M, V, V, VB, VI, V, F8, M, V, M, M, V)],
+    (PROFILE, "outline_points"): [(M, M, V, V, VB, VI, V, M)],
+    (AZIMUTH, "descend"): [(VI, M, MI, *MOTION, I8, I8)],
+    (AZIMUTH, "greedy"): [(I8, M, MI, *MOTION)],
+    (AZIMUTH, "spreads"): [(VI, M, MI, *MOTION)],
+    (AZIMUTH, "energy"): [(VI, M, MI, *MOTION)],
+    (AZIMUTH, "add_appearance_ratio"): [(Q, T, T, MI, V, F8, F8, I8, M)],
+    (AZIMUTH, "add_shape_ratio"): [(T, Q, T, MI, F8, F8, I8, M)],
+    (AZIMUTH, "differences"): [(Q, T, MI, VI, I8, F8, M)],
+    ("processing.track.registration.consistency_kernels", "consistency_terms"): [
+        (T, MI, M4, M4, VI, VI, MI, V, V, V, "boolean", T, M, M)
+    ],
+    ("processing.track.appearance_ratio", "_appearance_at"): [(M4, M, M4, VI, V, V, F8, M)],
+    ("processing.contact.physics.steps_cpu", "roll_rows"): [ROLL, (*ROLL[:5], f"{F8}[:,:]", *ROLL[6:])],
+    ("processing.contact.physics.solver_cpu", "solve_rows"): [(T, M, F8, M, F8, I8, F8, I8)],
+    ("processing.field.fuse", "_integrate"): [(T4, T4, T4, T4, Q4, V4, F4, F4, M4, M4, M4, T4, MB, "uint8[:,:,:]", MB)],
+    ("processing.motion.se3_kernels", "exponential"): [(V,)],
+    ("processing.motion.se3_kernels", "inverse"): [(M,)],
+    ("processing.sensor.surface_kernel", "fit_surface"): [(M4, MB, V, I8, F8, M4, T4)],
+    ("recordings.alignment.kernels", "project"): [(M4, T, V, V, T, M)],
+    ("recordings.alignment.kernels", "draw"): [(M4, T, M, M4, V)],
+    ("recordings.film.raster_kernels", "fill"): [(T, T, M, T)],
+}
+"""Kernels that Python calls, the slow ones to compile first, with the types that they are called with; what they call
+is compiled with them."""
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--jobs", type=int, default=0, help="processes (default: cores)")
+    given = parser.parse_args()
+    begun, cpu_s = time.monotonic(), 0.0
+    modules = list(dict.fromkeys(module for module, _ in KERNELS))
+    with multiprocessing.get_context("spawn").Pool(given.jobs or None) as pool:
+        for module, seconds in pool.imap_unordered(compiled, modules):
+            cpu_s += seconds
+            if seconds > 1:
+                print(f"compiled {module} in {seconds:.1f} CPU-s", flush=True)
+    print(f"{len(KERNELS)} kernels are there after {time.monotonic() - begun:.0f} s ({cpu_s:.1f} CPU-s)")
+    return 0
+
+
+def compiled(module: str) -> tuple[str, float]:
+    """A module's kernels in one process, as they call each other: its name, and CPU seconds that compiling them (or
+    reading what is there) took."""
+    imported, begun = import_module(module), time.process_time()
+    for (its, name), signatures in KERNELS.items():
+        for types in signatures if its == module else ():
+            getattr(imported, name).compile(written(types))
+    return module, time.process_time() - begun
+
+
+def written(types: tuple[str, ...]) -> str:
+    """As numba reads it."""
+    return f"({', '.join(types)},)"
+
+
+def unforeseen() -> list[str]:
+    """Kernels that this process had compiled for other types than those above."""
+    from numba.core.sigutils import normalize_signature
+
+    found = []
+    for (module, name), signatures in KERNELS.items():
+        foreseen = {normalize_signature(written(types))[0] for types in signatures}
+        used = getattr(import_module(module), name).signatures
+        found += [f"{module}.{name}{types}" for types in used if types not in foreseen]
+    return found
+
+
+if __name__ == "__main__":
+    sys.exit(main())
