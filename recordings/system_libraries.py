@@ -1,4 +1,5 @@
-"""Libraries of the system that no wheel brings: which Debian package has each, and those that set-up unpacked.
+"""Libraries of the system that no wheel brings: which Debian package has each, and those that set-up unpacked; and a
+place for compiled kernels where the system offers none.
 
 Standard library only: `tools/check_system.py` reads this before there is a virtual environment, and `recordings` loads
 it first of all.
@@ -6,9 +7,13 @@ it first of all.
 
 from __future__ import annotations
 
+import atexit
 import ctypes
+import os
 import re
+import shutil
 import sys
+import tempfile
 from pathlib import Path
 
 NEEDED = {
@@ -73,3 +78,25 @@ def advice(error: ImportError) -> str | None:
 def install_line(packages: list[str]) -> str:
     """One line to copy, for Debian and Ubuntu."""
     return f"apt-get update && apt-get install -y --no-install-recommends {' '.join(packages)}"
+
+
+def place_kernel_cache(package: Path) -> None:
+    """numba keeps compiled kernels beside the sources, else in the user's cache. Where neither can be written to, which
+    it refuses, names a folder of this process alone (`NUMBA_CACHE_DIR`), which is removed at the end."""
+    if os.environ.get("NUMBA_CACHE_DIR") or _may_write(package) or _may_write(_users_cache()):
+        return
+    folder = tempfile.mkdtemp(prefix="tosslab-kernels-")
+    os.environ["NUMBA_CACHE_DIR"] = folder  # children use it too
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+
+
+def _users_cache() -> Path:
+    """numba's own choice is in here."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser())
+
+
+def _may_write(folder: Path) -> bool:
+    """Whether files can be made in the folder, which is made where it is not there."""
+    while not folder.exists() and folder != folder.parent:
+        folder = folder.parent
+    return os.access(folder, os.W_OK | os.X_OK)
