@@ -56,7 +56,7 @@ def test_the_sample_by_name_leaves_its_results_where_one_works_not_among_the_ins
     class Came(BaseException):  # the command turns an Exception into words
         pass
 
-    def vision(args: object, session: object, name: str, out: Path) -> None:
+    def vision(args: object, engine: object, session: object, name: str, out: Path) -> None:
         raise Came(out.resolve())
 
     monkeypatch.chdir(tmp_path)
