@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import sys
 import threading
-import traceback
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -14,10 +13,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from processing import backends
-from processing.engine.each import Engine, InTurn, SideBySide, Stopped
-from processing.engine.jobs import chosen_jobs
-from processing.engine.slurm import AT_ONCE, slurm_jobs
-from processing.engine.workers import Shown, Worker
 from processing.given_masks import add_masks_argument
 from processing.variants import CONTACT_ONLY, DEFAULT, NAMES, TRACKERS, WITH_MODEL, rows_of
 from recordings.console import Outcome, Parser, command_parser, progress_for, run_command, shared_board
@@ -26,6 +21,7 @@ from recordings.notices import Notice
 
 if TYPE_CHECKING:
     from processing.config import Config
+    from processing.engine.each import Engine
     from processing.run import Run
     from processing.variants import Variant
     from recordings.results.folder import Scope
@@ -141,6 +137,11 @@ def _work(args: argparse.Namespace) -> Outcome:
 @contextmanager
 def _engine(args: argparse.Namespace, first: Path) -> Iterator[Engine]:
     """What computes the stages: this process, several on this machine, or jobs of a cluster."""
+    from processing.engine.each import InTurn, SideBySide
+    from processing.engine.jobs import chosen_jobs
+    from processing.engine.slurm import AT_ONCE, slurm_jobs
+    from processing.engine.workers import Worker
+
     jobs, why = (args.jobs or AT_ONCE, None) if args.executor == "slurm" else chosen_jobs(args.jobs)
     if why is not None:
         print(f"toss-process: {why}", file=sys.stderr)
@@ -167,6 +168,10 @@ def _many(args: argparse.Namespace, engine: Engine, sessions: Sequence[Path], na
 
 def _alone(args: argparse.Namespace, engine: Engine, path: Path, name: str) -> dict[str, Any]:
     """One of several sessions: its document, or why it failed."""
+    import traceback
+
+    from processing.engine.each import Stopped
+
     try:
         outcome = _process(args, engine, path, name, several=True)
     except Stopped:
@@ -241,6 +246,8 @@ def _process(args: argparse.Namespace, engine: Engine, path: Path, name: str, se
 
 def _vision(args: argparse.Namespace, engine: Engine, session: Session, name: str, out: Path) -> Run:
     """Every row that was asked for."""
+    from processing.engine.each import InTurn
+    from processing.engine.workers import Shown
     from processing.pipeline import process
     from processing.run import each
     from processing.start import start_run, with_table
