@@ -30,7 +30,7 @@ def outcome_of(call: Callable[[], object]) -> Outcome:
     try:
         call()
     except Exception as wrong:
-        told = {"kind": type(wrong).__name__, "message": str(wrong), "trace": traceback.format_exc()}
+        told: Outcome = {"kind": type(wrong).__name__, "message": str(wrong), "trace": traceback.format_exc()}
         if isinstance(wrong, OSError):
             told |= {"kind": "OSError", "arguments": [wrong.errno, wrong.strerror, wrong.filename]}
         if isinstance(wrong, ImportError):

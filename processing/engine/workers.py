@@ -12,6 +12,7 @@ import signal
 import sys
 import threading
 import time
+from functools import partial
 from multiprocessing.connection import Connection, wait
 from typing import Any
 
@@ -92,8 +93,6 @@ _to_parent: Connection | None = None
 
 def work(pipe: Connection) -> None:
     """What a worker does: computes what it is sent, until nothing is sent any more."""
-    import cloudpickle
-
     global _to_parent
     _to_parent = pipe
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -104,7 +103,13 @@ def work(pipe: Connection) -> None:
             call = pipe.recv_bytes()
         except (EOFError, OSError):
             return
-        pipe.send(outcome_of(lambda sent=call: cloudpickle.loads(sent)()))
+        pipe.send(outcome_of(partial(_called, call)))
+
+
+def _called(call: bytes) -> None:
+    import cloudpickle
+
+    cloudpickle.loads(call)()
 
 
 def _quiet() -> None:
