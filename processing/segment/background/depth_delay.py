@@ -12,11 +12,11 @@ tosses tells the delay and how sure it is.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Bool, Float, Float32, Int64
 from numpy import ndarray as Array
 
 from processing.segment.background.foreground import (
@@ -50,6 +50,9 @@ class DepthDelaySettings:
     """... faster than this."""
     steady: float = 0.35
     """An impact's frame, whose speeds before and after differ by more than this share, tells nothing."""
+    fast_frames: int = 12
+    slow_frames: int = 4
+    """Of each toss so many of the fastest frames are looked at, and of the slowest."""
     least_px: float = 0.1
     """A way between two outlines errs by no less."""
     blur_px: float = 1.0
@@ -86,20 +89,35 @@ def sightings(
     frames: RgbdFrames, masks: Sequence[Bool[Array, "h w"]], scene: StaticScene, s: DepthDelaySettings
 ) -> Sightings:
     """Of the frames of one toss in which the object moves steadily or not at all; `masks`: where it is, roughly."""
-    centers = np.array([_center(m) for m in masks])
-    ways, speeds = [], []
-    for i in range(1, len(masks) - 1):
-        before_s, after_s = np.diff(frames.times_ns[i - 1 : i + 2]) * 1e-9
-        before, after = (centers[i] - centers[i - 1]) / before_s, (centers[i + 1] - centers[i]) / after_s
-        speed = (centers[i + 1] - centers[i - 1]) / (before_s + after_s)
-        usual = float(np.linalg.norm(speed))
-        if not np.isfinite(usual) or float(np.linalg.norm(after - before)) > s.steady * usual + s.moving_px_s:
-            continue
-        way = _way(frames[i], masks[i], scene, usual, s)
+    speeds = _steady_speeds(frames.times_ns, masks, s)
+    ways, told = [], []
+    for i in _chosen(np.linalg.norm(speeds, axis=1), s):
+        way = _way(frames[i], masks[i], scene, float(np.linalg.norm(speeds[i])), s)
         if way is not None:
             ways.append(way)
-            speeds.append(speed)
-    return Sightings(np.array(ways).reshape(-1, 2), np.array(speeds).reshape(-1, 2))
+            told.append(speeds[i])
+    return Sightings(np.array(ways).reshape(-1, 2), np.array(told).reshape(-1, 2))
+
+
+def _steady_speeds(
+    times_ns: Int64[Array, " n"], masks: Sequence[Bool[Array, "h w"]], s: DepthDelaySettings
+) -> Float[Array, "n 2"]:
+    """Speed of the object in the image (pixels a second) at each frame; NaN where it is not seen whole or is hit."""
+    centers = np.array([_center(m) for m in masks])
+    steps = np.diff(centers, axis=0) / (np.diff(times_ns) * 1e-9)[:, None]
+    mean = 0.5 * (steps[1:] + steps[:-1])
+    jump = np.linalg.norm(steps[1:] - steps[:-1], axis=1)
+    steady = jump < s.steady * np.linalg.norm(mean, axis=1) + s.moving_px_s
+    out = np.full((len(masks), 2), np.nan)
+    out[1:-1] = np.where(steady[:, None], mean, np.nan)
+    return out
+
+
+def _chosen(speed_px_s: Float[Array, " n"], s: DepthDelaySettings) -> Int64[Array, " m"]:
+    """The fastest frames of a toss, and some of the slowest."""
+    order = np.argsort(speed_px_s)
+    order = order[np.isfinite(speed_px_s[order])]
+    return np.unique(np.concatenate([order[: s.slow_frames], order[-s.fast_frames :]])).astype(np.int64)
 
 
 def delay_of(seen: Sightings, s: DepthDelaySettings) -> DepthDelay | None:
@@ -145,8 +163,12 @@ def _way(
 ) -> Float[Array, "2"] | None:
     """From where depth shows the object to where colour does (x, y; pixels); None where either does not show it."""
     reach = int(np.ceil(speed_px_s * s.longest_s)) + s.border_px
-    near = nearer_than_scene(frame.depth_m, scene, s.foreground) & grown(mask, reach)
-    body = largest_component(near)
+    around = window_around(mask, 2 * (reach + s.border_px))
+    if around is None:
+        return None
+    mask, frame = mask[around], replace(frame, depth_m=frame.depth_m[around], color_rgb=frame.color_rgb[around])
+    scene = replace(scene, **{name: whole[around] for name, whole in vars(scene).items()})
+    body = largest_component(nearer_than_scene(frame.depth_m, scene, s.foreground) & grown(mask, reach))
     part, at = window_around(body, s.border_px), window_around(body, s.border_px + reach)
     if part is None or at is None or int(body.sum()) < 30 or int((body & mask).sum()) < 0.2 * int(mask.sum()):
         return None
