@@ -113,11 +113,11 @@ def _steady_speeds(
     return out
 
 
-def _chosen(speed_px_s: Float[Array, " n"], s: DepthDelaySettings) -> Int64[Array, " m"]:
+def _chosen(speed_px_s: Float[Array, " n"], s: DepthDelaySettings) -> list[int]:
     """The fastest frames of a toss, and some of the slowest."""
     order = np.argsort(speed_px_s)
     order = order[np.isfinite(speed_px_s[order])]
-    return np.unique(np.concatenate([order[: s.slow_frames], order[-s.fast_frames :]])).astype(np.int64)
+    return [int(i) for i in np.unique(np.concatenate([order[: s.slow_frames], order[-s.fast_frames :]]))]
 
 
 def delay_of(seen: Sightings, s: DepthDelaySettings) -> DepthDelay | None:
