@@ -15,6 +15,9 @@ class _RestampedToss(Toss):
         self.info, self.index = stamped.info, stamped.index
         self._stamped, self._later_ns = stamped, later_ns
 
+    def __reduce__(self) -> tuple[type[Toss], tuple[Toss, int]]:
+        return _RestampedToss, (self._stamped, self._later_ns)
+
     def rgbd(self, camera: str = "d455") -> RgbdFrames:
         """Colour frames with their depth, whose time is put right."""
         return self._stamped.rgbd(camera).with_depth_later(self._later_ns)
