@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Generic, TypeVar, overload
@@ -98,16 +98,6 @@ class RgbdFrames(Frames[RgbdFrame]):
         self.depth_times_ns = depth_times_ns
         self.without_depth = without_depth
         self.unused_depth = unused_depth
-
-    def with_depth_later(self, later_ns: int) -> RgbdFrames:
-        """The same frames with depth's times later by a constant."""
-
-        def load(i: int) -> RgbdFrame:
-            frame = self[i]
-            return replace(frame, depth_time_ns=frame.depth_time_ns + later_ns)
-
-        times_ns = self.depth_times_ns + later_ns
-        return RgbdFrames(self.times_ns, load, times_ns, self.without_depth, self.unused_depth)
 
 
 @dataclass(frozen=True)

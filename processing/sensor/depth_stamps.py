@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 from processing.sensor.still import ThinnedSession
+from recordings.records import RgbdFrame
 from recordings.session import RgbdFrames, Session, Toss
 from recordings.tracks import RigCalibration
 
@@ -15,12 +19,19 @@ class _RestampedToss(Toss):
         self.info, self.index = stamped.info, stamped.index
         self._stamped, self._later_ns = stamped, later_ns
 
-    def __reduce__(self) -> tuple[type[Toss], tuple[Toss, int]]:
+    def __reduce__(self) -> tuple[Any, ...]:
         return _RestampedToss, (self._stamped, self._later_ns)
 
     def rgbd(self, camera: str = "d455") -> RgbdFrames:
         """Colour frames with their depth, whose time is put right."""
-        return self._stamped.rgbd(camera).with_depth_later(self._later_ns)
+        frames, later_ns = self._stamped.rgbd(camera), self._later_ns
+
+        def load(i: int) -> RgbdFrame:
+            frame = frames[i]
+            return replace(frame, depth_time_ns=frame.depth_time_ns + later_ns)
+
+        depth_times_ns = frames.depth_times_ns + later_ns
+        return RgbdFrames(frames.times_ns, load, depth_times_ns, frames.without_depth, frames.unused_depth)
 
 
 class RestampedSession(Session):

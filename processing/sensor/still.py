@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -159,6 +160,9 @@ class _ThinnedToss(Toss):
         self.path, self.file, self.calibration = whole.path, whole.file, whole.calibration
         self.info, self.index = whole.info, whole.index
         self._whole, self._kept = whole, kept
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _ThinnedToss, (self._whole, self._kept)
 
     def rgbd(self, camera: str = "d455") -> RgbdFrames:
         """The kept frames of the camera that the stretches were found from."""

@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cloudpickle
 import numpy as np
 import pytest
 
@@ -143,3 +144,14 @@ def test_of_a_thinned_session_only_the_kept_frames_are_seen_at_their_own_depths_
     assert isinstance(session, ThinnedSession)
     every = session.whole.toss(0).rgbd()
     np.testing.assert_array_equal(every.depth_times_ns, every.times_ns + 5_000_000)
+
+
+def test_another_process_sees_the_same_frames_at_the_same_times(record_tiny: Record) -> None:
+    whole = Session.open(record_tiny(tosses=(0,), frames=COUNT))
+    kept = kept_of([(4, 15)], COUNT, StillSettings(kept=2))
+    for here in (with_depth_later(whole, 5_000_000), with_depth_later(ThinnedSession(whole, {0: kept}), 5_000_000)):
+        for sent in (here.toss, here.toss(0)):
+            there = cloudpickle.loads(cloudpickle.dumps(sent))
+            frames = (there(0) if sent == here.toss else there).rgbd()
+            np.testing.assert_array_equal(frames.depth_times_ns, here.toss(0).rgbd().depth_times_ns)
+            assert frames[3].depth_time_ns - frames[3].time_ns == 5_000_000
