@@ -14,6 +14,7 @@ from processing.refine.icp import IcpConfig
 from processing.refine.image_residuals import JudgeConfig
 from processing.refine.joint import JointConfig
 from processing.refine.redrawn_frames import RedrawConfig
+from processing.segment.background.depth_delay import DepthDelaySettings
 from processing.segment.background.depth_scale import DepthScaleSettings
 from processing.segment.background.follow import BackgroundSettings
 from processing.segment.background.static_scene import SceneSettings
@@ -70,6 +71,7 @@ class Config:
     scene: SceneSettings = field(default_factory=SceneSettings)
     rig: RigSettings = field(default_factory=RigSettings)
     masks: BackgroundSettings = field(default_factory=BackgroundSettings)
+    depth_delay: DepthDelaySettings = field(default_factory=DepthDelaySettings)
     find: FindSettings = field(default_factory=FindSettings)
     given_masks: GivenMasks = DEFAULT_MASKS
     """Which of the session's masks are used: see processing.given_masks."""

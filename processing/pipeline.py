@@ -22,7 +22,7 @@ from processing.stages.lose import lose, without_lost
 from processing.stages.model import bring_model
 from processing.stages.place import place_shape
 from processing.stages.register import register
-from processing.stages.rig import refine_rig
+from processing.stages.rig import refine_rig, with_depth_in_time
 from processing.stages.rollouts import roll_out
 from processing.stages.scene import learn_static_scene
 from processing.stages.segment import segment
@@ -39,7 +39,8 @@ def process(run: Run, variant: Variant, scope: Scope, model: Path | None = None)
     scene = learn_static_scene(run)
     rig = refine_rig(run, scene)
     found = find_object(run, scene, rig)
-    masks = each(run, run.tosses, lambda t: segment(run, t, scene, rig, found))
+    run = with_depth_in_time(run, scene, all_masks(run, scene, rig, found))
+    masks = all_masks(run, scene, rig, found)  # read again, but where depth's stamps were wrong
     run = without_lost(run, masks)
     images = {t: raw_images(run, t, rig, masks[t]) for t in run.tosses}
     if model is not None:
@@ -51,6 +52,11 @@ def process(run: Run, variant: Variant, scope: Scope, model: Path | None = None)
             together(run, variant, scope, alone, images))  # fmt: skip
     lost = {t: lose(run, t, masks[t]) for t in run.lost}
     return write_record(run, variant, scope, last, lost, scene, rig, masks)
+
+
+def all_masks(run: Run, scene: Done, rig: Done, found: Done | None) -> dict[int, Done]:
+    """The object's masks in every toss."""
+    return each(run, run.tosses, lambda t: segment(run, t, scene, rig, found))
 
 
 def with_model(run: Run, images: Mapping[int, Images], model: Path) -> Pass:

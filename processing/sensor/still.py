@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -158,11 +159,14 @@ class _ThinnedToss(Toss):
     def __init__(self, whole: Toss, kept: Kept) -> None:
         self.path, self.file, self.calibration = whole.path, whole.file, whole.calibration
         self.info, self.index = whole.info, whole.index
-        self._kept = kept
+        self._whole, self._kept = whole, kept
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _ThinnedToss, (self._whole, self._kept)
 
     def rgbd(self, camera: str = "d455") -> RgbdFrames:
         """The kept frames of the camera that the stretches were found from."""
-        frames, at = super().rgbd(camera), self._kept.positions
+        frames, at = self._whole.rgbd(camera), self._kept.positions
         without = tuple(int(i) for i in np.flatnonzero(np.isin(at, frames.without_depth)))
         return RgbdFrames(frames.times_ns[at], lambda i: frames[int(at[i])], frames.depth_times_ns[at], without,
                           frames.unused_depth)  # fmt: skip
@@ -181,11 +185,15 @@ class ThinnedSession(Session):
         self.whole, self._kept = whole, kept
 
     def toss(self, toss: int) -> Toss:
-        found = super().toss(toss)
+        found = self.whole.toss(toss)
         return _ThinnedToss(found, self._kept[toss]) if toss in self._kept else found
 
     def with_calibration(self, calibration: RigCalibration) -> ThinnedSession:
-        return ThinnedSession(self.whole.with_calibration(calibration), self._kept)
+        return self.of(self.whole.with_calibration(calibration))
+
+    def of(self, whole: Session) -> ThinnedSession:
+        """The kept frames of the same session seen otherwise."""
+        return ThinnedSession(whole, self._kept)
 
 
 def whole_session(session: Session) -> Session:

@@ -67,7 +67,7 @@ def at_color_time(
         return frame
     part = window_around(body, 0)
     assert part is not None
-    strange = _unlike_scene(frame, scene, at, s, look)
+    strange = unlike_scene(frame, scene, at, s, look)
     template = body[part].astype(np.float32)
     steps = [(dx, dy) for dy in range(-reach, reach + 1) for dx in range(-reach, reach + 1)]
     top, left = part[0].start - at[0].start, part[1].start - at[1].start
@@ -82,7 +82,7 @@ def at_color_time(
     return frame if chosen is None else _moved(frame, scene, body, (int(chosen[0]), int(chosen[1])))
 
 
-def _unlike_scene(
+def unlike_scene(
     frame: RgbdFrame, scene: StaticScene, at: tuple[slice, slice], s: LateDepthSettings, look: ForegroundSettings
 ) -> Float32[Array, "a b"]:
     """1 where the colour is not the scene's, less where it may be the scene's in a shadow."""
