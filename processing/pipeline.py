@@ -20,6 +20,7 @@ from processing.stages.field import learn_field
 from processing.stages.find import find_object
 from processing.stages.lose import lose, without_lost
 from processing.stages.model import bring_model
+from processing.stages.noise import measure_noise
 from processing.stages.place import place_shape
 from processing.stages.register import register
 from processing.stages.rig import refine_rig
@@ -40,7 +41,7 @@ def process(run: Run, variant: Variant, scope: Scope, model: Path | None = None)
     rig = refine_rig(run, scene)
     found = find_object(run, scene, rig)
     masks = each(run, run.tosses, lambda t: segment(run, t, scene, rig, found))
-    run = without_lost(run, masks)
+    run = without_lost(replace(run, noise=measure_noise(run, scene).result.noise), masks)
     images = {t: raw_images(run, t, rig, masks[t]) for t in run.tosses}
     if model is not None:
         last = with_model(run, images, model)

@@ -200,9 +200,7 @@ def _moved_by_depth(
     return cv2.morphologyEx(nearer.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)) > 0
 
 
-def _largest_other(
-    frame: RgbdFrame, scene: StaticScene, moved: Bool[Array, "h w"], s: BackgroundSettings
-) -> int:
+def _largest_other(frame: RgbdFrame, scene: StaticScene, moved: Bool[Array, "h w"], s: BackgroundSettings) -> int:
     """Size of the largest thing, away from the object, that is not scene: what looks as the scene always looked there
     has not moved, however its depth flickers."""
     count, labels, stats, _ = cv2.connectedComponentsWithStats(moved.astype(np.uint8), connectivity=4)

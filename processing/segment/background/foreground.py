@@ -101,9 +101,7 @@ def moved_pixels(frame: RgbdFrame, scene: StaticScene, s: ForegroundSettings) ->
     return cv2.morphologyEx(found, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8)) > 0
 
 
-def shadow_distance(
-    color: Float32[Array, "*n 3"], scene: Float32[Array, "*n 3"], lit: float
-) -> Float32[Array, "*n"]:
+def shadow_distance(color: Float32[Array, "*n 3"], scene: Float32[Array, "*n 3"], lit: float) -> Float32[Array, "*n"]:
     """Distance of a colour from the scene's colour in any shade between black and `lit` times as bright."""
     shade = (color * scene).sum(-1) / np.maximum((scene * scene).sum(-1), 1.0)
     return np.linalg.norm(color - np.clip(shade, 0.0, lit)[..., None] * scene, axis=-1).astype(np.float32)

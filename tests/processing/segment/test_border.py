@@ -42,9 +42,7 @@ def body() -> np.ndarray:
     return mask > 0
 
 
-def picture(
-    scene: StaticScene, color: tuple[float, float, float], fattened_px: int, shade: float | None
-) -> RgbdFrame:
+def picture(scene: StaticScene, color: tuple[float, float, float], fattened_px: int, shade: float | None) -> RgbdFrame:
     """The body above the table; its depth reaches too far outside, and its shadow lies below it."""
     rng, mask = np.random.default_rng(1), body()
     rgb, depth = scene.color_rgb.copy(), scene.depth_m + rng.normal(0, 0.0015, SIZE).astype(np.float32)
