@@ -41,7 +41,9 @@ def process(run: Run, variant: Variant, scope: Scope, model: Path | None = None)
     rig = refine_rig(run, scene)
     found = find_object(run, scene, rig)
     masks = each(run, run.tosses, lambda t: segment(run, t, scene, rig, found))
-    run = without_lost(replace(run, noise=measure_noise(run, scene).result.noise), masks)
+    noise = measure_noise(run, scene)
+    run = replace(run, noise=noise.result.noise, warnings=(*run.warnings, *say.of_noise(noise)))
+    run = without_lost(run, masks)
     images = {t: raw_images(run, t, rig, masks[t]) for t in run.tosses}
     if model is not None:
         last = with_model(run, images, model)
