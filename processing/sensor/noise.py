@@ -21,6 +21,11 @@ ICP_LEAST_SIGMA_M = 0.0008
 JOINT_LEAST_SIGMA_M = 0.0005
 """The same in the joint objective, where all frames of all tosses speak."""
 
+STEREO_BASELINE_M = 0.095
+"""Between the D455's infrared cameras (data sheet). Along a surface that slants too much disparity grows by more than
+a pixel a pixel, where no matcher follows (Pollard, Mayhew and Frisby, "PMF: a stereo correspondence algorithm using a
+disparity gradient limit", Perception 1985): where baseline/z times the tangent of the slant exceeds 1."""
+
 BASELINE_PIXELS_PER_MEASUREMENT = 9.0
 """Frame-to-model baseline: so many depth pixels count as one in the covariance."""
 ICP_POINTS_PER_MEASUREMENT = 300.0

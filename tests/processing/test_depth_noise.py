@@ -11,6 +11,7 @@ from processing.field.network import ObjectField
 from processing.field.poses import PoseConfig, refine_poses
 from processing.field.rays import RayDataset
 from processing.sensor.noise import DepthNoise, measured_noise
+from processing.sensor.surface_kernel import fit_surface
 from recordings.geometry import CameraModel
 
 CAMERA = CameraModel("d455", 320, 240, np.array([[300.0, 0, 160], [0, 300.0, 120], [0, 0, 1]]))
@@ -79,3 +80,18 @@ def test_poses_are_as_sure_as_the_number_of_independent_pixels_says() -> None:
     usual = told(DepthNoise(0.003, 10.0))
     assert told(DepthNoise(0.003, 40.0)) == pytest.approx(usual / 4, rel=0.02)
     assert told(DepthNoise(0.006, 10.0)) == pytest.approx(usual / 4, rel=0.1)
+
+
+@pytest.mark.parametrize(("distance_m", "cosine", "kept"), [(0.5, 0.15, False), (0.5, 0.22, True), (1.0, 0.11, True)])
+def test_a_surface_is_one_as_far_as_a_stereo_camera_can_follow_its_slant(
+    distance_m: float, cosine: float, kept: bool
+) -> None:
+    """Disparity grows by baseline / z * tan(slant) a pixel: at 0.5 m a steeper slant is lost than at 1 m."""
+    focal, side = 2000.0, np.sqrt(1 - cosine**2)
+    x = (np.arange(41) - 20) / focal
+    row = cosine * distance_m / (cosine - side * x)
+    depth = np.tile(row, (41, 1)).astype(np.float32)
+    out, normals = np.zeros((41, 41), np.float32), np.zeros((41, 41, 3), np.float32)
+    rays = np.array([1 / focal, 1 / focal, x[0], x[0]])
+    fit_surface(depth, np.ones((41, 41), bool), rays, 3, 0.012, out, normals)
+    assert (out[20, 20] > 0) == kept
