@@ -20,12 +20,11 @@ from processing.stages.field import learn_field
 from processing.stages.find import find_object
 from processing.stages.lose import lose, without_lost
 from processing.stages.model import bring_model
-from processing.stages.noise import measure_noise
 from processing.stages.place import place_shape
 from processing.stages.register import register
 from processing.stages.rig import refine_rig
 from processing.stages.rollouts import roll_out
-from processing.stages.scene import learn_static_scene
+from processing.stages.scene import learn_static_scene, measure_noise
 from processing.stages.segment import segment
 from processing.stages.track import track
 from processing.store import Done

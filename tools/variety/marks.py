@@ -164,7 +164,7 @@ def fusion_floor_cm(session_path: Path, truth_path: Path, place: Path) -> float 
     from processing.field.fuse import fuse
     from processing.field.learn import TossViews, chosen_views
     from processing.field.mesh import grid_mesh
-    from processing.sensor.frames import with_depth_scale
+    from processing.sensor.frames import metric_frames
     from processing.start import start_run
     from recordings.errors import BadInput
     from recordings.progress import Silent
@@ -179,7 +179,7 @@ def fusion_floor_cm(session_path: Path, truth_path: Path, place: Path) -> float 
         scale = float(json.loads((truth_path / "sensor_truth.json").read_text())["depth_scale"])
         tosses = []
         for number in session.tosses:
-            frames = with_depth_scale(session.toss(number).rgbd("d455"), scale)
+            frames = metric_frames(session.toss(number).rgbd("d455"), scale)
             track = _known(ObjectTrack.nowhere(number, run.camera.frame, frames.times_ns), truth)
             tosses.append(TossViews(frames, frames.depth_times_ns, _masks(truth_path / f"toss_{number:02d}"), track))
         views = chosen_views(tosses, run.camera, run.config.shape)
