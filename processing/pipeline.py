@@ -24,7 +24,7 @@ from processing.stages.place import place_shape
 from processing.stages.register import register
 from processing.stages.rig import refine_rig, with_depth_in_time
 from processing.stages.rollouts import roll_out
-from processing.stages.scene import learn_static_scene
+from processing.stages.scene import learn_static_scene, measure_noise
 from processing.stages.segment import segment
 from processing.stages.track import track
 from processing.store import Done
@@ -41,6 +41,8 @@ def process(run: Run, variant: Variant, scope: Scope, model: Path | None = None)
     found = find_object(run, scene, rig)
     run = with_depth_in_time(run, scene, all_masks(run, scene, rig, found))
     masks = all_masks(run, scene, rig, found)  # read again, but where depth's stamps were wrong
+    noise = measure_noise(run, scene)
+    run = replace(run, noise=noise.result.noise, warnings=(*run.warnings, *say.of_noise(noise)))
     run = without_lost(run, masks)
     images = {t: raw_images(run, t, rig, masks[t]) for t in run.tosses}
     if model is not None:

@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 
 from processing.backends import settings_of
 from processing.config import Config
+from processing.sensor.noise import PUBLISHED, DepthNoise
 from processing.sensor.still import Kept
 from processing.store import Store, plain
 from recordings.geometry import CameraModel, Transform
@@ -57,6 +58,8 @@ class Run:
     """Of tosses with long still stretches, the frames that are worked on (`sensor/still.py`)."""
     lost: tuple[int, ...] = ()
     """Tosses in which the object is not seen: they show the scene and the robot only."""
+    noise: DepthNoise = PUBLISHED
+    """How this session's depth errs (stage `noise`)."""
 
     @property
     def recorded(self) -> tuple[int, ...]:

@@ -9,16 +9,20 @@ from typing import Any
 from processing.config import CycleConfig
 from processing.refine.image_residuals import Difference
 from processing.run import Run
+from processing.sensor.noise import PUBLISHED
 from processing.stages.lose import SEE
 from processing.stages.register import RegisterResult
 from processing.stages.rig import RigResult
 from processing.stages.rollouts import RolloutResult
+from processing.stages.scene import NoiseResult
 from processing.stages.segment import SegmentResult
 from processing.stages.track import TrackResult
 from processing.store import Done
 from recordings.mcap import arm_codec
 from recordings.notices import Notice
 
+NOISY = 2.0
+"""Depth that errs by this much more than the data sheet says is told."""
 MANY_UNFIT = 1 / 3
 """Share of a toss's frames from which on more than noise is the likelier cause."""
 
@@ -58,6 +62,19 @@ def of_rig(run: Run, done: Done[RigResult]) -> list[Notice]:
         )
         found.append(Notice("rig", "low", seen, sure="likely"))
     return found
+
+
+def of_noise(done: Done[NoiseResult]) -> list[Notice]:
+    """Depth that errs by far more than the camera's data sheet says."""
+    found = done.result
+    if not found.frames or found.sigma_at_1m < NOISY * PUBLISHED.sigma_at_1m:
+        return []
+    seen = (
+        f"depth of the table scatters by {1e3 * found.sigma_at_1m:.0f} mm at 1 m "
+        f"(data sheet: {1e3 * PUBLISHED.sigma_at_1m:.0f}), in patches of {found.patch_px:.0f} pixels"
+    )
+    do = "most often too little texture or projected light, else a dirty, shiny or moved camera; poses are less sure"
+    return [Notice("noise", "low", seen, do)]
 
 
 def of_masks(toss: int, done: Done[SegmentResult]) -> list[Notice]:
@@ -105,7 +122,8 @@ def of_register(done: Done[RegisterResult]) -> list[Notice]:
     found, left_out, unsure = [], list(done.result.not_joined), list(done.result.ambiguous)
     if left_out:
         seen = f"tosses {left_out} could not be brought into the object frame of the others: lost"
-        found.append(Notice("register", "high", seen, "another object, or none of its sides that the others show"))
+        do = f"most often they show other sides than the rest, or too little detail; seldom it is another object: {SEE}"
+        found.append(Notice("register", "high", seen, do))
     if unsure:
         seen = f"tosses {unsure}: the object looks alike from several sides; their object frame may be turned"
         found.append(Notice("register", "high", seen, "compare their frames in `toss-view RESULTS`", "possible"))
@@ -114,8 +132,9 @@ def of_register(done: Done[RegisterResult]) -> list[Notice]:
 
 def kept_apart(tosses: Sequence[int]) -> Notice:
     """Tosses that no one shape explains with the others."""
-    seen = f"tosses {list(tosses)}: their place among the others is wrong, no one shape explains both: kept apart"
-    return Notice("register", "high", seen, "another object, or one that looks alike from several sides")
+    seen = f"tosses {list(tosses)}: no one shape explains their outlines and those of the others: kept apart"
+    do = "most often an object that looks alike from several sides, else a track that is off; seldom another object"
+    return Notice("register", "high", seen, f"{do}: {SEE}")
 
 
 def lost_among_all(toss: int) -> tuple[Notice, ...]:

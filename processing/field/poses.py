@@ -14,7 +14,7 @@ from torch import Tensor
 
 from processing.field.network import ObjectField
 from processing.field.rays import RayDataset
-from processing.sensor import noise
+from processing.sensor.noise import PUBLISHED, DepthNoise
 from recordings.constants import LUMA
 
 
@@ -24,8 +24,8 @@ class PoseConfig:
     """Gauss-Newton steps a round."""
     most_pixels: int = 1500
     """Pixels a view, drawn at random."""
-    depth_sigma_m: float = noise.FIELD_SIGMA_M
-    """Standard deviation of depth at 0.8 m; it grows with the square of the distance."""
+    noise: DepthNoise = PUBLISHED
+    """How depth errs, and how many neighbouring pixels, in colour too, say one thing: as the session shows it."""
     color_sigma: float = 0.07
     """Of luminance, 0..1."""
     prior_rotation_rad: float = 0.02
@@ -89,7 +89,8 @@ def _normal_equations(
     luma, luma_gradient = _with_gradient(lambda x: model.color(x) @ torch.tensor(LUMA, device=x.device), on_surface)
     luma_gradient = luma_gradient - sdf_gradient * ((luma_gradient * along).sum(-1) / facing)[:, None]
     seen = dataset.rgb[rays] @ torch.tensor(LUMA, device=points.device)
-    depth_sigma = config.depth_sigma_m * (dataset.depth[rays] / noise.FIELD_SIGMA_AT_M) ** 2
+    depth_sigma = config.noise.sigma_at_1m * dataset.depth[rays] ** 2
+    independent = _independent(dataset, rays, len(rotation), config.noise.patch_px)
     colored = dataset.colored[rays]
     difference = _less_exposure(luma - seen, view, len(rotation), colored)
     information = torch.zeros(len(rotation), 6, 6, device=points.device)
@@ -101,12 +102,19 @@ def _normal_equations(
         jacobian = torch.cat([torch.linalg.cross(points, gradient), gradient], -1)
         scaled = (residual / sigma).abs()
         weight = torch.where(scaled < 1.5, torch.ones_like(scaled), 1.5 / scaled) / sigma**2
-        weight = torch.where(scaled < outlier, weight, torch.zeros_like(weight)) * noise.FIELD_INDEPENDENT_SHARE
+        weight = torch.where(scaled < outlier, weight, torch.zeros_like(weight)) * independent
         if residual is difference:
             weight = weight * colored
         information.index_add_(0, view, weight[:, None, None] * jacobian[:, :, None] * jacobian[:, None, :])
         right.index_add_(0, view, -(weight * residual)[:, None] * jacobian)
     return information, right
+
+
+def _independent(dataset: RayDataset, rays: Tensor, views: int, patch_px: float) -> Tensor:
+    """Weight of each drawn ray (1 at most) by which all of a view count as its pixels would if one in `patch_px` were
+    independent."""
+    seen, drawn = (torch.bincount(v, minlength=views) for v in (dataset.view, dataset.view[rays]))
+    return (seen / (patch_px * drawn.clamp(min=1))).clamp(max=1.0)[dataset.view[rays]]
 
 
 def _less_exposure(difference: Tensor, view: Tensor, views: int, colored: Tensor) -> Tensor:

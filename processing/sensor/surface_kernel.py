@@ -7,6 +7,8 @@ from typing import no_type_check
 import numpy as np
 from numba import njit
 
+from processing.sensor.noise import STEREO_BASELINE_M
+
 
 @no_type_check
 @njit(cache=True, nogil=True, fastmath=True)
@@ -86,8 +88,8 @@ def fit_surface(depth_m, inside, rays, radius, edge_share, out_m, normals):  # n
             n2 = a - n0 * x - n1 * y
             length = np.sqrt(n0 * n0 + n1 * n1 + n2 * n2)
             cosine = a / (length * np.sqrt(x * x + y * y + 1.0))
-            if cosine < 0.12:  # grazing: flying pixels, not a surface
-                continue
+            if cosine * np.sqrt(1.0 / (a * a) + STEREO_BASELINE_M**2) < STEREO_BASELINE_M:
+                continue  # steeper than the disparity gradient limit: flying pixels, not a surface
             out_m[v, u] = 1.0 / a
             normals[v, u, 0] = -n0 / length
             normals[v, u, 1] = -n1 / length

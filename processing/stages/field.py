@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-from processing.field.learn import learn_shape
+from processing.field.learn import LearnConfig, learn_shape
 from processing.images import Images, track_and_image_keys
 from processing.run import Run
+from processing.sensor.noise import DepthNoise
 from processing.store import Done, plain
 from recordings.results.folder import read_shape, read_track, write_shape
 
-VERSION = 7
+VERSION = 8
 
 
 @dataclass(frozen=True)
@@ -30,14 +31,20 @@ def learn_field(
     """O. Where no frame looks it is the shape `prior_shape`, if there is one (else the hull of what was seen)."""
     inputs = {"for": name, **track_and_image_keys(tracks, images)}
     inputs |= {} if prior_shape is None else {"believed": prior_shape.key}  # the name that stored keys were made with
+    config = _with_noise(run.config.shape, run.noise)
 
     def compute(folder: Path) -> FieldResult:
         views = [images[t].open().views(read_track(done.folder, t)) for t, done in tracks.items()]
         body = None if prior_shape is None else read_shape(prior_shape.folder)
         progress = run.progress(f"{name}: shape")
-        shape, used = learn_shape(views, run.camera, run.config.shape, run.device, progress, body)
+        shape, used = learn_shape(views, run.camera, config, run.device, progress, body)
         write_shape(folder, shape)
         unseen = 0.0 if shape.observed is None else float((~shape.observed).mean())
         return FieldResult(used, len(shape.vertices_m), round(unseen, 4))
 
-    return run.store.run("field", VERSION, plain(run.config.shape), inputs, FieldResult, compute)
+    return run.store.run("field", VERSION, plain(config), inputs, FieldResult, compute)
+
+
+def _with_noise(config: LearnConfig, noise: DepthNoise) -> LearnConfig:
+    poses = replace(config.field.poses, noise=noise)
+    return replace(config, field=replace(config.field, poses=poses))

@@ -135,11 +135,12 @@ def test_images_that_change_their_size_are_refused(tiny_world: Any) -> None:
         learn_scene([frame, smaller], None, SceneSettings())
 
 
-def test_a_shadow_is_the_scene_in_another_shade() -> None:
+def test_a_shadow_is_the_scene_in_any_darker_shade() -> None:
     wood = np.full((2, 2, 3), (150.0, 110.0, 70.0), dtype=np.float32)
-    assert shadow_distance(0.7 * wood, wood, 0.55).max() < 1e-3
-    assert shadow_distance(0.3 * wood, wood, 0.55).min() > 40
-    assert shadow_distance(wood[..., ::-1].copy(), wood, 0.55).min() > 50
+    for shade in (0.05, 0.3, 0.7, 1.0):
+        assert shadow_distance(shade * wood, wood, 1.1).max() < 1e-3
+    assert shadow_distance(1.5 * wood, wood, 1.1).min() > 70
+    assert shadow_distance(wood[..., ::-1].copy(), wood, 1.1).min() > 50
 
 
 def test_small_holes_are_filled_and_a_handles_hole_is_not() -> None:

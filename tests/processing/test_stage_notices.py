@@ -22,7 +22,10 @@ from processing.evaluate.table import summary
 from processing.field.learn import LearnConfig
 from processing.field.train import FieldConfig
 from processing.run import Run
+from processing.sensor.noise import PUBLISHED
+from processing.stages.register import RegisterResult
 from processing.stages.rig import RigResult
+from processing.stages.scene import NoiseResult
 from processing.stages.segment import SegmentResult
 from processing.stages.track import TrackResult
 from processing.store import Done
@@ -45,6 +48,24 @@ def rig_of(robot: Any, scale: float = 1.0, sigma: float | None = None) -> Done[R
 def masks_of(others_moving: int = 0, without_depth: int = 0) -> Done[SegmentResult]:
     followed = {"others_moving": others_moving, "badly_exposed": 0}
     return done(SegmentResult(20, 0, without_depth=without_depth, followed=followed))
+
+
+def test_depth_that_errs_by_far_more_than_the_data_sheet_says_is_told_with_its_size() -> None:
+    def of(sigma: float, frames: int = 3) -> list[Notice]:
+        return stage_notices.of_noise(done(NoiseResult(frames, sigma, 40.0)))
+
+    assert not of(1.9 * PUBLISHED.sigma_at_1m)
+    assert not of(PUBLISHED.sigma_at_1m, frames=0)
+    (told,) = of(0.0121)
+    assert "12 mm at 1 m (data sheet: 5), in patches of 40 pixels" in told.text
+
+
+def test_tosses_that_do_not_fit_the_others_are_told_with_the_likeliest_cause_first() -> None:
+    left_out = stage_notices.of_register(done(RegisterResult((1,), (), (None,))))[0]
+    for notice in (left_out, stage_notices.kept_apart([1])):
+        assert "most often" in notice.text
+        assert notice.text.index("most often") < notice.text.index("seldom")
+        assert notice.text.index("seldom") < notice.text.index("another object")
 
 
 def still_arm() -> ArmStates:

@@ -15,7 +15,7 @@ from numpy import ndarray as Array
 from processing.evaluate.learned_values import learned_values
 from processing.evaluate.score import Value, chamfers, score_variant, true_mesh
 from processing.evaluate.truth import Truth, open_truth
-from recordings.geometry import rotation_log
+from recordings.geometry import rotation_exp, rotation_log
 from recordings.results.folder import Results, VariantRecord
 from recordings.session import Session
 from recordings.tracks import ObjectTrack
@@ -23,6 +23,8 @@ from recordings.tracks import ObjectTrack
 WRONG_DEG, WRONG_M = 5.0, 0.02
 CHI2_6_95 = 12.592
 """95 % of a chi-squared variable of six degrees of freedom."""
+LEAST_VARIANCE = 1e-10
+"""A pose that is claimed to be known better than 0.01 mm and 0.01 mrad is where a track defined its object frame."""
 TURNED = ("can", "bottle", "bowl")
 """Bodies of revolution about their z; plain ones show no turn about it."""
 
@@ -117,35 +119,42 @@ def silent_wrong(track: ObjectTrack, true: Float[Array, "n 4 4"], round_body: bo
 
 def normalised_errors(track: ObjectTrack, true: Float[Array, "n 4 4"]) -> Float[Array, " m"]:
     """e^T C^-1 e of the tracked frames with a covariance: rotation vector and shift in camera axes. The object frame,
-    which nobody knows, is that which fits all of the toss's tracked frames best (mean rotation, median shift)."""
+    which nobody knows, is the one in which the track is most plausible by its own covariances: a track that is sure of
+    its first frame, where it defined its object frame, is judged by how it goes on from there."""
     rows = [
         k for k, s in enumerate(track.status)
         if s == "tracked" and np.isfinite(true[k]).all() and np.isfinite(track.covariance[k]).all()
     ]  # fmt: skip
     if len(rows) < 2:
         return np.zeros(0)
-    shifts = np.array([np.linalg.inv(true[k]) @ track.camera_from_object[k] for k in rows])
-    best = np.eye(4)
-    best[:3, :3] = _mean_rotation(shifts[:, :3, :3])
-    best[:3, 3] = np.median(shifts[:, :3, 3], axis=0)
-    out = []
-    for k in rows:
-        found, wanted = track.camera_from_object[k], true[k] @ best
-        e = np.append(rotation_log(_orthonormal(found[:3, :3] @ wanted[:3, :3].T)), found[:3, 3] - wanted[:3, 3])
-        spread = track.covariance[k] + 1e-12 * np.eye(6)
-        out.append(float(e @ np.linalg.solve(spread, e)))
-    return np.array(out)
+    found, wanted = track.camera_from_object[rows], true[rows]
+    weight = np.linalg.inv(track.covariance[rows] + LEAST_VARIANCE * np.eye(6))
+    surest = int(np.argmax(np.linalg.slogdet(weight)[1]))
+    frame = np.linalg.inv(wanted[surest]) @ found[surest]
+    for _ in range(10):
+        error, turned = _errors(found, wanted @ frame), (wanted @ frame)[:, :3, :3]
+        each = weight / (1 + np.einsum("ni,nij,nj->n", error, weight, error) / 6)[:, None, None]
+        J = np.zeros((len(rows), 6, 6))
+        J[:, :3, :3] = J[:, 3:, 3:] = turned
+        normal = np.einsum("nji,njk,nkl->il", J, each, J)
+        step = np.linalg.solve(normal, np.einsum("nji,njk,nk->i", J, each, error))
+        move = np.eye(4)
+        move[:3, :3], move[:3, 3] = rotation_exp(step[:3]), step[3:]
+        frame = frame @ move
+    error = _errors(found, wanted @ frame)
+    chosen = np.trace(track.covariance[rows], axis1=1, axis2=2) > LEAST_VARIANCE  # not where the frame was defined
+    return np.asarray(np.einsum("ni,nij,nj->n", error, weight, error)[chosen])
+
+
+def _errors(found: Float[Array, "n 4 4"], wanted: Float[Array, "n 4 4"]) -> Float[Array, "n 6"]:
+    turns = [rotation_log(_orthonormal(f[:3, :3] @ w[:3, :3].T)) for f, w in zip(found, wanted)]
+    return np.concatenate([np.array(turns), found[:, :3, 3] - wanted[:, :3, 3]], axis=1)
 
 
 def _orthonormal(matrix: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
     """The rotation nearest to any matrix, however far (a mean of rotations that scatter is far)."""
     u, _, vt = np.linalg.svd(matrix)
     return u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
-
-
-def _mean_rotation(rotations: Float[Array, "n 3 3"]) -> Float[Array, "3 3"]:
-    """The chordal mean."""
-    return _orthonormal(rotations.mean(axis=0))
 
 
 def fusion_floor_cm(session_path: Path, truth_path: Path, place: Path) -> float | None:
@@ -155,8 +164,8 @@ def fusion_floor_cm(session_path: Path, truth_path: Path, place: Path) -> float 
     from processing.field.fuse import fuse
     from processing.field.learn import TossViews, chosen_views
     from processing.field.mesh import grid_mesh
-    from processing.pipeline import start_run
-    from processing.sensor.frames import with_depth_scale
+    from processing.sensor.frames import metric_frames
+    from processing.start import start_run
     from recordings.errors import BadInput
     from recordings.progress import Silent
 
@@ -170,7 +179,7 @@ def fusion_floor_cm(session_path: Path, truth_path: Path, place: Path) -> float 
         scale = float(json.loads((truth_path / "sensor_truth.json").read_text())["depth_scale"])
         tosses = []
         for number in session.tosses:
-            frames = with_depth_scale(session.toss(number).rgbd("d455"), scale)
+            frames = metric_frames(session.toss(number).rgbd("d455"), scale)
             track = _known(ObjectTrack.nowhere(number, run.camera.frame, frames.times_ns), truth)
             tosses.append(TossViews(frames, frames.depth_times_ns, _masks(truth_path / f"toss_{number:02d}"), track))
         views = chosen_views(tosses, run.camera, run.config.shape)

@@ -188,7 +188,7 @@ def follow(
     ratio = min(mask.sum(), area) / max(mask.sum(), area, 1)
     solid = moved & near & (frame.depth_m > 0)  # what only looks different may be the object's shadow
     others_near = int((solid & ~grown(mask, 3)).sum()) > s.least_px or int((solid & ~mask).sum()) > 3 * s.least_px
-    largest = _largest_other(moved & ~grown(mask, 9), s)
+    largest = _largest_other(frame, scene, moved & ~grown(mask, 9), s)
     return Found(mask, float(np.clip(sure * min(1.0, ratio / 0.7), 0, 1)), others_px, others_near, largest)
 
 
@@ -200,10 +200,19 @@ def _moved_by_depth(
     return cv2.morphologyEx(nearer.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)) > 0
 
 
-def _largest_other(moved: Bool[Array, "h w"], s: BackgroundSettings) -> int:
-    """Size of the largest thing, away from the object, that is not scene."""
-    _, _, stats, _ = cv2.connectedComponentsWithStats(moved.astype(np.uint8), connectivity=4)
-    return int(stats[1:, cv2.CC_STAT_AREA].max(initial=0))
+def _largest_other(frame: RgbdFrame, scene: StaticScene, moved: Bool[Array, "h w"], s: BackgroundSettings) -> int:
+    """Size of the largest thing, away from the object, that is not scene: what looks as the scene always looked there
+    has not moved, however its depth flickers."""
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(moved.astype(np.uint8), connectivity=4)
+    order = 1 + np.argsort(-stats[1:count, cv2.CC_STAT_AREA])
+    for k in order:
+        if stats[k, cv2.CC_STAT_AREA] < s.least_px:
+            break
+        thing = labels == k
+        apart = np.abs(frame.color_rgb[thing] - scene.color_rgb[thing]).max(-1)
+        if (apart > np.maximum(s.foreground.color_step, 4 * scene.color_sigma[thing])).mean() > 0.5:
+            return int(stats[k, cv2.CC_STAT_AREA])
+    return 0
 
 
 def _shifted(mask: Bool[Array, "h w"], by_px: Float[Array, "2"]) -> Bool[Array, "h w"]:

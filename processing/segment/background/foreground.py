@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -11,9 +11,14 @@ from numpy import ndarray as Array
 
 from processing.segment.background.static_scene import StaticScene
 from processing.sensor.noise import stereo_sigma_m
+from recordings.geometry import CameraModel
 from recordings.records import RgbdFrame
 
 Window = tuple[slice, slice]
+FATTENED_RAD = 6 / 447
+"""Stereo matching over windows gives the pixels beside an edge the nearer side's depth as far as the window's support
+reaches: 6 infrared pixels of census and 7x7 aggregation (Keselman et al., "Intel RealSense Stereoscopic Depth Cameras",
+CVPR workshops 2017) at the focal length of 848 pixels over 87 degrees (D455's data sheet)."""
 
 
 @dataclass(frozen=True)
@@ -29,28 +34,36 @@ class ForegroundSettings:
     color_share: float = 0.4
     """The same as a share of the object's typical difference nearby: a blurred edge lies where it halves."""
     weight_color: float = 2.0
-    weight_scene_color: float = 1.5
-    contrast: float = 2.0
-    """An object that differs from the scene by so many times the least step is distinguished from it by colour in
-    full."""
-    least_contrast: float = 0.15
-    weight_nearer: float = 1.5
-    weight_scene_depth: float = 1.5
+    """The most that colour says of a pixel: less, where the object nearby looks like the scene around it (`votes`)."""
+    weight_depth: float = 1.5
+    """The most that depth says: less, where beside this object returns that are not its own say the same."""
     middle_sigmas: float = 3.0
     """So many standard deviations before the scene, depth speaks neither for the object nor for the scene."""
-    weight_sigma: float = 0.75
-    """How fast it turns to either side, per standard deviation."""
+    weight_sigma: float = 0.5
+    """How fast it turns to either side, as a share of what it says, per standard deviation."""
     weight_likeness: float = 1.5
     """Weight of the colour histograms, used where the scene's colour is unknown or other things touch the object."""
-    darkest_shadow: float = 0.55
-    """A shadow on the scene is its own colour times at least this."""
+    lit: float = 1.1
+    """What lies in no shadow is at most this much brighter than the scene was. Shadows may be of any darkness."""
+    unseen_px: float = 10.0
+    """So many pixels that nobody saw, of all kinds alike, temper what few pixels show."""
+    ring_px: int = 8
+    """Width of the ring around the border's band that shows the scene, its shadows included."""
     smoothing: float = 1.2
     """Pull of a neighbouring pixel of the same colour."""
     edge_color: float = 25.0
     """A colour step of this size between neighbours cuts the pull."""
     sweeps: int = 8
     band_inside_px: int = 3
+    """The border is drawn anew so far inside of the rough one: as far as the depth camera fattens (`for_camera`) ..."""
     band_outside_px: int = 3
+    """... and outside of it."""
+
+    def for_camera(self, camera: CameraModel | None) -> ForegroundSettings:
+        """With a band that is as wide as stereo matching fattens what stands in front, in this camera's pixels."""
+        if camera is None:
+            return self
+        return replace(self, band_inside_px=max(self.band_inside_px, round(FATTENED_RAD * camera.fx)))
 
 
 def kernel(radius_px: int) -> UInt8[Array, "k k"]:
@@ -88,13 +101,10 @@ def moved_pixels(frame: RgbdFrame, scene: StaticScene, s: ForegroundSettings) ->
     return cv2.morphologyEx(found, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8)) > 0
 
 
-def shadow_distance(
-    color: Float32[Array, "h w 3"], scene: Float32[Array, "h w 3"], darkest: float
-) -> Float32[Array, "h w"]:
-    """Distance of a colour from the scene's colour in any shade between `darkest` and 1.1 times as bright."""
+def shadow_distance(color: Float32[Array, "*n 3"], scene: Float32[Array, "*n 3"], lit: float) -> Float32[Array, "*n"]:
+    """Distance of a colour from the scene's colour in any shade between black and `lit` times as bright."""
     shade = (color * scene).sum(-1) / np.maximum((scene * scene).sum(-1), 1.0)
-    shade = np.clip(shade, darkest, 1.1)
-    return np.linalg.norm(color - shade[..., None] * scene, axis=-1).astype(np.float32)
+    return np.linalg.norm(color - np.clip(shade, 0.0, lit)[..., None] * scene, axis=-1).astype(np.float32)
 
 
 def pixel_log_odds(
@@ -107,32 +117,89 @@ def pixel_log_odds(
 ) -> Float32[Array, "a b"]:
     """Log-odds that a pixel of the window is the object, from its colour and its depth against the scene's.
 
-    A pixel at the scene's depth may lie in the object's shadow, so only another hue speaks for the object there.
-    `likeness` (log-odds of the object's colours) stands in for the scene's colour where that is not known.
+    A pixel has another hue than the scene, the scene's colour in a shadow, or the scene's colour; it lies before the
+    scene, at it, or gives no return. What each of these is worth, the frame itself tells: how often it is seen well
+    inside of the object, and how often around it. `likeness` (log-odds of the object's colours) stands in for the
+    scene's colour where that is not known.
     """
-    color, depth = frame.color_rgb[at].astype(np.float32), frame.depth_m[at]
-    scene_color, scene_depth = scene.color_rgb[at], scene.depth_m[at]
-    nearer = nearer_than_scene(depth, _cut(scene, at), s)
-    at_scene = (depth > 0) & (scene_depth > 0) & ~nearer
-    plain = np.linalg.norm(color - scene_color, axis=-1)
-    on_table = at_scene & (np.abs(scene_depth - depth) < np.maximum(0.006, 3 * stereo_sigma_m(scene_depth)))
-    differs = np.where(on_table, shadow_distance(color, scene_color, s.darkest_shadow), plain)
-    inside = cv2.erode(rough[at].astype(np.uint8), kernel(s.band_inside_px)).astype(np.float32)
-    typical = cv2.blur(plain * inside, (9, 9)) / np.maximum(cv2.blur(inside, (9, 9)), 1e-3)
-    least = np.maximum(s.color_step + 3 * scene.color_sigma[at], s.color_share * typical)
-    sure = np.clip(np.abs(differs - least) / (0.3 * least), 0.2, 1.0)
-    # where the object looks like the scene behind it, a colour like the scene's speaks for neither
-    contrast = np.clip(typical / (s.contrast * (s.color_step + 3 * scene.color_sigma[at])), s.least_contrast, 1.0)
-    against = s.weight_scene_color * np.where(inside.any(), contrast, 1.0)
-    by_color = np.where(differs > least, s.weight_color, -against) * sure * scene.known[at]
-    sigma = np.maximum(scene.depth_sigma_m[at], 0.7 * stereo_sigma_m(scene_depth))
-    step = (scene_depth - depth) / np.maximum(sigma, 1e-4) - s.middle_sigmas
-    graded = np.clip(s.weight_sigma * step, -s.weight_scene_depth, s.weight_nearer)
-    by_depth = np.where((depth > 0) & (scene_depth > 0), graded, s.weight_nearer * nearer)
-    total = by_color + by_depth
+    color, depth, part = frame.color_rgb[at].astype(np.float32), frame.depth_m[at], _cut(scene, at)
+    solid = rough[at].astype(np.uint8)
+    core, band = cv2.erode(solid, kernel(s.band_inside_px)) > 0, cv2.dilate(solid, kernel(s.band_outside_px)) > 0
+    nearer = nearer_than_scene(depth, part, s)
+    ring = (cv2.dilate(band.astype(np.uint8), kernel(s.ring_px)) > 0) & ~band & ~nearer
+    by_color, like_scene = _color_votes(color, part, core, ring & part.known, s)
+    total = by_color + _depth_votes(depth, nearer, part, core, band & ~core, like_scene, s)
     if likeness is not None:
         total = total + s.weight_likeness * likeness
     return total.astype(np.float32)
+
+
+def _color_votes(
+    color: Float32[Array, "a b 3"], scene: StaticScene, core: Bool[Array, "a b"], ring: Bool[Array, "a b"],
+    s: ForegroundSettings,
+) -> tuple[Float32[Array, "a b"], Bool[Array, "a b"]]:  # fmt: skip
+    """What colour says of each pixel, and which pixels have the scene's own colour."""
+    plain = np.linalg.norm(color - scene.color_rgb, axis=-1)
+    hue = shadow_distance(color, scene.color_rgb, s.lit)
+    noise = s.color_step + 3 * scene.color_sigma
+    around_px = 4 * s.band_inside_px + 1
+    weight = np.maximum(_nearby(core, around_px), 1e-3)
+    at_hue, at_plain = (np.maximum(noise, s.color_share * _nearby(d * core, around_px) / weight) for d in (hue, plain))
+    other, like = hue > at_hue, plain <= at_plain
+    out = np.zeros_like(plain)
+    for kind in (other, ~other & ~like, ~other & like):
+        # the object's border may show any of its colours, and most likely those nearby
+        anywhere = (float((kind & core).sum()) + s.unseen_px / 3) / (float(core.sum()) + s.unseen_px)
+        beside = (_nearby(kind & core, around_px) + s.unseen_px * anywhere) / (_nearby(core, around_px) + s.unseen_px)
+        inside = np.maximum(anywhere, beside)
+        outside = (_nearby(kind & ring, around_px) + s.unseen_px / 3) / (_nearby(ring, around_px) + s.unseen_px)
+        out = np.where(kind, np.log(inside / outside).clip(-s.weight_color, s.weight_color), out)
+    sure = np.where(other, _sure(hue, at_hue), np.where(like, _sure(plain, at_plain), 1.0))
+    return (out * sure * scene.known).astype(np.float32), scene.known & like & ~other
+
+
+def _nearby(values: Array, size_px: int) -> Float32[Array, "a b"]:
+    """The sum over a square around each pixel."""
+    return np.asarray(cv2.boxFilter(values.astype(np.float32), -1, (size_px, size_px), normalize=False))
+
+
+def _sure(distance: Float32[Array, "a b"], least: Float32[Array, "a b"]) -> Float32[Array, "a b"]:
+    """1 where a distance is clearly on either side of a threshold."""
+    return np.clip(np.abs(distance - least) / (0.3 * least), 0.2, 1.0)
+
+
+def _depth_votes(
+    depth_m: Float32[Array, "a b"], nearer: Bool[Array, "a b"], scene: StaticScene, core: Bool[Array, "a b"],
+    border: Bool[Array, "a b"], like_scene: Bool[Array, "a b"], s: ForegroundSettings,
+) -> Float32[Array, "a b"]:  # fmt: skip
+    """What depth says of each pixel; no return says nothing, as dark and grazing sides give none either."""
+    at_scene = ~nearer & (depth_m > 0)
+    before = _vote(nearer & core, core, _fattened(nearer, core, border, like_scene), like_scene & border, s)
+    behind = _vote(at_scene & core, core, float((at_scene & like_scene & border).sum()), like_scene & border, s)
+    sigma = np.maximum(scene.depth_sigma_m, 0.7 * stereo_sigma_m(scene.depth_m))
+    side = np.clip(s.weight_sigma * ((scene.depth_m - depth_m) / np.maximum(sigma, 1e-4) - s.middle_sigmas), -1, 1)
+    graded = np.where(side > 0, max(before, 0.0) * side, -min(behind, 0.0) * side)
+    both = (depth_m > 0) & (scene.depth_m > 0)
+    return np.where(both, graded, max(before, 0.0) * nearer).astype(np.float32)
+
+
+def _fattened(
+    nearer: Bool[Array, "a b"], core: Bool[Array, "a b"], border: Bool[Array, "a b"], like_scene: Bool[Array, "a b"]
+) -> float:
+    """How many pixels of the border show the scene's colour and yet the object's depth, which a stereo camera gives to
+    what is beside an edge: less those of the object, of which a share looks like the scene everywhere."""
+    own = float(like_scene[core].mean()) if core.any() else 1.0
+    strange = float((nearer & border & ~like_scene).sum())
+    return max(float((nearer & border & like_scene).sum()) - strange * own / max(1 - own, 1e-3), 0.0)
+
+
+def _vote(
+    hits: Bool[Array, "a b"], core: Bool[Array, "a b"], seen: float, beside: Bool[Array, "a b"], s: ForegroundSettings
+) -> float:
+    """Log-odds of the object, of what `hits` of its core and `seen` of the scene's pixels beside it show."""
+    own = (float(hits.sum()) + s.unseen_px / 3) / (float(core.sum()) + s.unseen_px)
+    other = (seen + s.unseen_px / 3) / (float(beside.sum()) + s.unseen_px)
+    return float(np.clip(np.log(own / other), -s.weight_depth, s.weight_depth))
 
 
 def smooth(
@@ -166,7 +233,7 @@ def refine_border(
     It is one piece, or all pieces of at least `pieces_px` pixels.
     """
     rough = fill_holes(rough)
-    at = window_around(rough, s.band_outside_px + 9)
+    at = window_around(rough, s.band_outside_px + s.ring_px + 1)
     if at is None:
         return rough, 0.0
     part = rough[at].astype(np.uint8)

@@ -38,10 +38,9 @@ class LateDepthSettings:
         """How a pixel's log-odds are weighed where depth was moved."""
         return replace(
             s,
-            weight_nearer=self.border_depth * s.weight_nearer,
-            weight_scene_depth=self.border_depth * s.weight_scene_depth,
-            band_inside_px=self.border_px,
-            band_outside_px=self.border_px,
+            weight_depth=self.border_depth * s.weight_depth,
+            band_inside_px=max(s.band_inside_px, self.border_px),
+            band_outside_px=max(s.band_outside_px, self.border_px),
         )
 
 
@@ -88,7 +87,7 @@ def unlike_scene(
     """1 where the colour is not the scene's, less where it may be the scene's in a shadow."""
     color, own = frame.color_rgb[at].astype(np.float32), scene.color_rgb[at]
     least = np.maximum(s.color_step, 4 * scene.color_sigma[at])
-    other = np.where(shadow_distance(color, own, look.darkest_shadow) > least, 1.0, s.shadow)
+    other = np.where(shadow_distance(color, own, look.lit) > least, 1.0, s.shadow)
     unlike = np.where(np.abs(color - own).max(-1) > least, other, 0.0)
     return np.where(scene.known[at], unlike, 0.5).astype(np.float32)
 

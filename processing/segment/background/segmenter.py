@@ -72,7 +72,7 @@ class BackgroundSegmenter:
         in the toss alone. `gravity`: its direction in the camera frame, where that is known."""
         self._scene = scene
         self._camera = camera
-        self._settings = settings
+        self._settings = replace(settings, foreground=settings.foreground.for_camera(camera))
         self._drawn = drawn
         self._detection, self._gravity, self._find_settings = detection, gravity, find or FindSettings()
         self.counts = {"badly_exposed": 0, "others_moving": 0}

@@ -76,6 +76,23 @@ def test_errors_drawn_from_the_covariance_are_inside_95_per_cent_of_its_ellipsoi
     assert np.mean(mean) == pytest.approx(1.0, abs=0.08)
 
 
+def test_a_track_that_is_sure_of_the_frame_where_it_defined_its_object_frame_is_judged_from_there():
+    """A random walk away from the first frame, with the covariance of a random walk."""
+    rng, mean = np.random.default_rng(2), []
+    for _ in range(20):
+        turns, shifts = (np.cumsum(s * rng.standard_normal((N, 3)), axis=0) for s in (0.01, 0.002))
+        poses, growing = TRUE.copy(), np.zeros((N, 6, 6))
+        for k in range(1, N):
+            poses[k, :3, :3] = rotation_exp(turns[k] - turns[0]) @ TRUE[k, :3, :3]
+            poses[k, :3, 3] += shifts[k] - shifts[0]
+            growing[k] = k * np.diag([0.01**2] * 3 + [0.002**2] * 3)
+        walked = replace(track(poses @ pose((1.0, 0.2, 0), (0.01, 0, 0.03))), covariance=growing)
+        errors = marks.normalised_errors(walked, TRUE)
+        assert len(errors) == N - 1
+        mean.append(errors.mean() / 6)
+    assert np.mean(mean) == pytest.approx(1.0, abs=0.2)
+
+
 def test_a_covariance_ten_times_too_small_is_found_out():
     poses = np.array([pose(0.01 * RNG.standard_normal(3), 0) @ T for T in TRUE])
     assert marks.normalised_errors(track(poses, sigma=(0.001, 0.002)), TRUE).mean() / 6 > 10
