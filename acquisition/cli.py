@@ -48,7 +48,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         nargs="?",
         const=LIVE[0],
         choices=LIVE,
-        help="look at each toss as soon as it is recorded, and say what to throw next; `pose`: the pose while it flies, too",
+        help="look at each toss when it is recorded, say what to throw next; `pose`: its pose while it flies, too",
     )
     parser.add_argument("--dry-run", action="store_true", help="plan and check the tosses; nothing moves or is written")
     parser.add_argument("--between", action="store_true", help="keep the frames between the tosses too")

@@ -102,7 +102,7 @@ def _record(
             report = record_views(recorder, session, setup, args.calibration, operator, interrupts)
         else:
             if args.live:
-                live = LiveSession(out, operator, lambda: recorder.take is None, pose=args.live == "pose")
+                live = LiveSession(out, operator, recorder, pose=args.live == "pose")
                 open_things.enter_context(live)
             session_run = SessionRun(
                 recorder, thrower, session, setup.calibration, operator, progress_for("preparing"), interrupts

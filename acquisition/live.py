@@ -1,7 +1,7 @@
 """`--live`: another process looks at each toss that is recorded; its lines come to the console between the takes.
 
-Recording depends on nothing of it: it is started niced in a session of its own, may fall behind, end or be killed, and all
-that is read of it is the file of its lines (recordings/results/live.py). Processing is never imported here.
+Recording depends on nothing of it: it is started niced in a session of its own, may fall behind, end or be killed, and
+all that is read of it is the file of its lines (recordings/results/live.py). Processing is never imported here.
 """
 
 from __future__ import annotations
@@ -13,16 +13,19 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
 from typing import IO
 
 from acquisition.operator import Operator
+from acquisition.streaming.recorder import Recorder
 from recordings.errors import BadInput
+from recordings.live_frames import FrameBoardWriter, LiveFrame, memory_folder
 from recordings.results.live import LineReader, live_folder, read_state
 
-POLL_S = 0.2
+POLL_S, FEED_S = 0.2, 0.002
+CAMERA = "d455"
+FAR_APART_NS = 20_000_000
 FOLLOWER, VIEWER = "processing.cli", "recordings.cli_view"
 NO_DISPLAY = "live: there is no display here; elsewhere on this machine: toss-view --live {session}"
 
@@ -39,15 +42,13 @@ class LiveSession:
     """The follower of a session that is being recorded, and the viewer. As a context: the lines are read until its end;
     the follower itself goes on, to make the session's results."""
 
-    def __init__(
-        self, session: Path, operator: Operator, between_takes: Callable[[], bool], pose: bool = False
-    ) -> None:
-        self._session, self._operator, self._between = session, operator, between_takes
-        self._arguments = ["--live-pose"] if pose else []
+    def __init__(self, session: Path, operator: Operator, recorder: Recorder, pose: bool = False) -> None:
+        self._session, self._operator, self._recorder, self._pose = session, operator, recorder, pose
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._listen, name="live", daemon=True)
         self._follower: subprocess.Popen[bytes] | None = None
         self._viewer: subprocess.Popen[bytes] | None = None
+        self._open = contextlib.ExitStack()
         self._said_end = False
 
     def __enter__(self) -> LiveSession:
@@ -56,8 +57,11 @@ class LiveSession:
         try:
             folder.mkdir(parents=True, exist_ok=True)
             with open(folder / "follow.log", "ab") as log:
-                follow = ("--follow", str(self._session), "--recorder", str(os.getpid()), *self._arguments)
+                follow = ("--follow", str(self._session), "--recorder", str(os.getpid()))
                 self._follower = _started(FOLLOWER, *follow, log=log)
+                if self._pose:
+                    self._feed = self._open.enter_context(FrameFeed(self._recorder))
+                    self._front = _started(FOLLOWER, *follow, "--live-pose", str(self._feed.path), log=log)
                 if has_display():
                     self._viewer = _started(VIEWER, "--live", str(self._session), log=log)
                 else:
@@ -72,9 +76,11 @@ class LiveSession:
     ) -> None:
         self._stop.set()
         self._thread.join(2.0)
+        self._open.close()
 
     def wait(self) -> bool:
-        """Stay until the follower has made the results, saying its lines; Ctrl-C leaves it at that. Whether it ended."""
+        """Stay until the follower has made the results, saying its lines; Ctrl-C leaves it at that. Whether it
+        ended."""
         if self._follower is None or self._follower.poll() is not None:
             self._say_lines()
             return True
@@ -97,7 +103,7 @@ class LiveSession:
 
     def _listen(self) -> None:
         while not self._stop.wait(POLL_S):
-            if self._between():
+            if self._recorder.take is None:
                 self._say_lines()
                 self._say_end()
 
@@ -115,6 +121,50 @@ class LiveSession:
             )
 
 
+class FrameFeed:
+    """The newest colour and depth image for the live pose, from a thread that may be slow. As a context."""
+
+    def __init__(self, recorder: Recorder) -> None:
+        self._recorder = recorder
+        self.path = memory_folder() / f"toss-record-{os.getpid()}-frames"
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="live frames", daemon=True)
+
+    def __enter__(self) -> FrameFeed:
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._stop.set()
+        self._thread.join(2.0)
+
+    def _run(self) -> None:
+        shown = -1
+        with FrameBoardWriter(self.path) as board:
+            while not self._stop.wait(FEED_S):
+                frame = newest_frame(self._recorder)
+                if frame is not None and frame.number != shown:
+                    shown = frame.number
+                    with contextlib.suppress(BadInput):  # another size in mid-session: the recorder tells of that
+                        board.put(frame)
+
+
+def newest_frame(recorder: Recorder) -> LiveFrame | None:
+    """Colour and depth that were received together last, with the session times that they have by now."""
+    looks = recorder.looks
+    color, depth = (recorder.latest.get(f"/{CAMERA}/{stream}") for stream in ("color", "depth"))
+    if color is None or depth is None or not looks or looks[-1].number != depth.number:
+        return None
+    depth_ns = looks[-1].time_ns
+    apart_ns = color.mid_exposure_ns - depth.mid_exposure_ns
+    if abs(apart_ns) > FAR_APART_NS:  # of two frames, one of which is not there yet
+        return None
+    host_ns = max(color.host_ns, depth.host_ns)
+    return LiveFrame(color.number, depth_ns + apart_ns, depth_ns, host_ns, color.pixels, depth.pixels, looks[-1].unit_m)
+
+
 def has_display() -> bool:
     """Whether a viewer's window can open here."""
     if not sys.platform.startswith("linux"):
@@ -123,8 +173,8 @@ def has_display() -> bool:
 
 
 def _started(module: str, *arguments: str, log: IO[bytes]) -> subprocess.Popen[bytes]:
-    """A module of the same environment in a session of its own: Ctrl-C at the recorder's terminal does not reach it, and
-    systems that share the processor by sessions give the recorder a share of its own."""
+    """A module of the same environment in a session of its own: Ctrl-C at the recorder's terminal does not reach it,
+    and systems that share the processor by sessions give the recorder a share of its own."""
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
     environment["PYTHONPATH"] = os.pathsep.join([str(Path(__file__).resolve().parent.parent),
                                                  *filter(None, [os.environ.get("PYTHONPATH", "")])])  # fmt: skip

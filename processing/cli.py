@@ -92,6 +92,7 @@ def _add_everyday(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--recorder", type=int, help=argparse.SUPPRESS
     )  # the process that records, of toss-record --live
+    parser.add_argument("--live-pose", type=Path, help=argparse.SUPPRESS)  # its frames, of toss-record --live pose
     parser.add_argument(
         "--table-from-depth", action="store_true", help="where the calibration lacks the table: take it from depth"
     )
@@ -171,6 +172,10 @@ def _follow(args: argparse.Namespace, name: str) -> Outcome:
     """Every toss as it comes; then the session as if it had been asked for."""
     from processing.live.command import follow_session
 
+    if args.live_pose is not None:
+        from processing.live.pose.command import serve_poses
+
+        return serve_poses(args.follow, args.live_pose, args.recorder)
     if args.sessions:
         raise BadInput(f"--follow {args.follow} follows one session; leave out {', '.join(args.sessions)}")
 

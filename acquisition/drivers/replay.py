@@ -7,8 +7,8 @@
     with player.camera("d455") as camera: frame = camera.read(0.1)
 
 Frames carry the session's own times as stamps of a clock named "session" and are received when they were, counted
-from the moment of `play`. Between two tosses the clock goes on by the time that passed since, and frame numbers go on by
-one: what was not recorded between them is no loss.
+from the moment of `play`. Between two tosses the clock goes on by the time that passed since, and frame numbers go on
+by one: what was not recorded between them is no loss.
 """
 
 from __future__ import annotations

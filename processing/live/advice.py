@@ -96,5 +96,6 @@ def _until_friction(throws: Mapping[int, Throw]) -> list[Option]:
     missing = LEAST_TOSSES - len(throws)
     if missing <= 0:
         return []
-    text = f"{missing} more that fly, hit the table and come to rest: friction cannot be told from fewer than {LEAST_TOSSES}"
+    need = f"friction cannot be told from fewer than {LEAST_TOSSES}"
+    text = f"{missing} more that fly, hit the table and come to rest: {need}"
     return [Option(text, 0.0)]

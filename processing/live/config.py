@@ -21,6 +21,12 @@ class LiveConfig:
     """Memory that it may take (data, not mapped files); beyond it ends and says so."""
     poll_s: float = 0.2
     """How often it looks for a finished toss."""
+    before_release_s: float = 0.25
+    after_rest_s: float = 0.15
+    """Frames from so long before the release until so long after the rest are looked at: what an arm does before, and
+    waiting, is left to the pipeline."""
+    least_thrown: int = 12
+    """Fewer frames between the two are no toss: all are looked at."""
     field_views: int = 14
     """Frames of a toss that the shape so far is fused from."""
     fuse: FuseConfig = field(default_factory=lambda: FuseConfig(voxel_m=0.003, most_cells=400_000))

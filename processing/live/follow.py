@@ -26,11 +26,14 @@ from processing.live.side_work import SideWork
 from processing.live.together import Joined, Together
 from processing.live.watch import FileId, ended, finished, finished_tosses
 from processing.run import CAMERA
+from processing.segment.background.static_scene import StaticScene
+from processing.segment.robot.of_session import Rig
 from recordings.errors import BadInput, TosslabError
 from recordings.progress import Progress
 from recordings.results.folder import write_shape
 from recordings.results.live import Kind, LiveWriter, State, live_folder
 from recordings.session import Session
+from recordings.session_writer import write_json
 from recordings.tracks import RigCalibration
 
 NO_TABLE = (
@@ -104,7 +107,8 @@ def followed_alone(session: Path) -> Iterator[None]:
         except OSError as held:
             lock.seek(0)
             raise BadInput(
-                f"{session} is followed already, by process {lock.read().strip() or 'of another user'}; look at what it "
+                f"{session} is followed already, by process {lock.read().strip() or 'of another user'}; look at "
+                f"what it "
                 f"finds with `toss-view --live {session}`, or end it first"
             ) from held
         lock.truncate(0)
@@ -188,8 +192,11 @@ class _Follower:
         self.said_behind_s = 0.0
         if self._idle():
             return True
-        if self.recorder is not None and not _alive(self.recorder) and not ended(self.session):
-            self.result.why = f"the recorder ended without closing the session; go on with `toss-record --resume --live {self.session}`"
+        if self.recorder is not None and not alive(self.recorder) and not ended(self.session):
+            self.result.why = (
+                "the recorder ended without closing the session; go on with "
+                f"`toss-record --resume --live {self.session}`"
+            )
         self._state("waiting")
         time.sleep(self.live.poll_s)
         return False
@@ -222,6 +229,7 @@ class _Follower:
         self.result.looked_at.append(toss)
         self._written(lambda: self.writer.toss(report))
         self._written(self._write_shape)
+        self._written(self._write_scene)
         self._say("verdict", f"{report.text()}, {report.seconds:.1f} s after it was recorded", toss)
         self._say_next(toss)
 
@@ -234,6 +242,13 @@ class _Follower:
     def _write_shape(self) -> None:
         if self.together.shape is not None:
             write_shape(self.writer.folder, self.together.shape)
+
+    def _write_scene(self) -> None:
+        """What the live pose needs beside the shape."""
+        if self.looker.scene is not None and self.looker.rig is not None:
+            StaticScene.read(self.looker.scene.folder).write(self.writer.folder)
+            scale = Rig.read(self.looker.rig.folder).depth_scale
+            write_json(self.writer.folder / "front.json", {"depth_scale": scale})
 
     def _forget(self, toss: int, why: str) -> None:
         self.done.pop(toss, None)
@@ -282,7 +297,8 @@ class _Follower:
             self.result.why = self.result.why or f"what is found cannot be written ({refused}); recording goes on"
 
 
-def _alive(process: int) -> bool:
+def alive(process: int) -> bool:
+    """Whether a process is there."""
     try:
         os.kill(process, 0)
     except ProcessLookupError:

@@ -29,8 +29,8 @@ CONTACTS, POINTS = 6, 24
 
 @dataclass(frozen=True)
 class LawSoFar:
-    """Friction and restitution with half their 95 % intervals; `told`: how much each toss said of friction (curvature of
-    its score over log friction; nothing where it said nothing), by toss."""
+    """Friction and restitution with half their 95 % intervals; `told`: how much each toss said of friction (curvature
+    of its score over log friction; nothing where it said nothing), by toss."""
 
     friction: float
     friction_half: float
@@ -81,7 +81,7 @@ def _prepared(
 
 
 def shrink_by(law: LawSoFar, toss: int) -> float:
-    """By what share friction's interval is expected to shrink with one more toss like this one (its part that tosses can
-    take away: what the law itself does not know stays)."""
+    """By what share friction's interval is expected to shrink with one more toss like this one (its part that tosses
+    can take away: what the law itself does not know stays)."""
     total, more = sum(law.told.values()), law.told.get(toss, 0.0)
     return 1.0 - float(np.sqrt(total / (total + more))) if total > 0 else 0.0

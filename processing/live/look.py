@@ -17,7 +17,8 @@ from processing.live.config import LiveConfig, light
 from processing.live.so_far import SessionSoFar
 from processing.live.verdict import Seen, what_is_seen
 from processing.live.watch import FileId
-from processing.run import Run
+from processing.run import CAMERA, Run
+from processing.sensor.still import Kept, ThinnedSession
 from processing.stages.find import find_object
 from processing.stages.lose import without_lost
 from processing.stages.rig import RigResult, refine_rig
@@ -66,9 +67,10 @@ class Looker:
         self.files[toss] = file
         session = self._open((toss,))
         try:
-            run = without_waiting(self._run(session, (toss,)))
+            run = self._run(session, (toss,))
             step("scene")
             scene, rig = self._shared(run)
+            run = thrown_frames(run, toss, self.live)
             step("masks")
             found = find_object(run, scene, rig)
             masks = segment(run, toss, scene, rig, found)
@@ -116,6 +118,23 @@ class Looker:
             return tuple(chosen_views([seen], run.camera, replace(run.config.shape, most_views=self.live.field_views)))
         except BadInput:
             return ()
+
+
+def thrown_frames(run: Run, toss: int, live: LiveConfig) -> Run:
+    """The run with the frames from shortly before the release until the rest, where the recorder has seen both; else
+    with few frames of every still stretch, as the pipeline has it."""
+    recorded = run.session.toss(toss)
+    window, times_ns = recorded.window(), recorded.rgbd(CAMERA).times_ns
+    if window.release_time_ns is None or window.rest_time_ns is None:
+        return without_waiting(run)
+    first = np.searchsorted(times_ns, window.release_time_ns - round(live.before_release_s * 1e9))
+    last = np.searchsorted(times_ns, window.rest_time_ns + round(live.after_rest_s * 1e9))
+    positions = np.arange(first, min(int(last), len(times_ns)), dtype=np.int64)
+    if len(positions) < live.least_thrown:
+        return without_waiting(run)
+    like = np.clip(np.arange(len(times_ns)) - int(first), 0, len(positions) - 1)
+    kept = {toss: Kept(positions, like)}
+    return replace(run, session=ThinnedSession(run.session, kept), kept=kept)
 
 
 def _track(run: Run, toss: int, images: TossImages) -> TossTrack:

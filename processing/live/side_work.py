@@ -1,5 +1,5 @@
-"""Work that nobody waits for, in a process of its own that begins with everything this one holds and may be ended at any
-instant: what took long is thrown away when a toss comes."""
+"""Work that nobody waits for, in a process of its own that begins with everything this one holds and may be ended at
+any instant: what took long is thrown away when a toss comes."""
 
 from __future__ import annotations
 

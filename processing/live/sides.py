@@ -1,7 +1,8 @@
-"""Which sides of the object were seen and touched so far, and how much another throw would add, by the covariances of what
-is there.
+"""Which sides of the object were seen and touched so far, and how much another throw would add, by the covariances of
+what is there.
 
-A side is a direction in the object frame. A frame tells the surface there with the camera's depth noise over the cosine at
+A side is a direction in the object frame. A frame tells the surface there with the camera's depth noise over the
+cosine at
 which it faces the camera; frames of one toss err together, so that a toss counts as one frame of its best view and a
 tenth of all. What nobody saw is the hull's guess.
 """

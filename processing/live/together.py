@@ -1,5 +1,5 @@
-"""The tosses of a session so far, in one object frame: where each lies, the shape that they show, friction, what to throw
-next."""
+"""The tosses of a session so far, in one object frame: where each lies, the shape that they show, friction, what to
+throw next."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ SHARED = "object"
 
 @dataclass(frozen=True, eq=False)
 class Joined:
-    """A toss among the others: its whole track in the shared object frame (in its own where it has no place), the frames
-    that others are compared with, what it told of the object's sides, and how it was thrown."""
+    """A toss among the others: its whole track in the shared object frame (in its own where it has no place), the
+    frames that others are compared with, what it told of the object's sides, and how it was thrown."""
 
     looked: Looked
     track: ObjectTrack

@@ -1,5 +1,5 @@
-"""What a session's results are so far, while it is recorded: `toss-process --follow` writes it, the console and the viewer
-read it. Nothing recorded depends on it.
+"""What a session's results are so far, while it is recorded: `toss-process --follow` writes it, the console and the
+viewer read it. Nothing recorded depends on it.
 
 ```
 <session>/results/live/lines.jsonl     one JSON object a line, appended: {"toss", "kind", "text", "unix_s"}
@@ -56,7 +56,8 @@ class TossSoFar:
     """One toss as it is known while the session goes on.
 
     `verdict`: what is wrong with it, nothing where it is good; `seen`: frames with a mask; `phases`: first frames of
-    flight, impact, rest (None: not found); `cost`: how badly it fits the others (None: it is the first, or has no place);
+    flight, impact, rest (None: not found); `cost`: how badly it fits the others (None: it is the first, or has no
+    place);
     `camera_from_object` (frames x 4 x 4, None where lost) in the object frame that the tosses share, where it is
     `placed`; `seconds`: from the finished file to this.
     """

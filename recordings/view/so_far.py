@@ -1,7 +1,8 @@
-"""A session while it is recorded, in rerun: the shape so far, the tosses' ways, the verdicts; what `toss-view --live` shows.
+"""A session while it is recorded, in rerun: the shape so far, the tosses' ways, the verdicts; what `toss-view --live`
+shows.
 
-Everything is read from results/live (recordings/results/live.py) and the finished tosses' files. Whether this runs, and how
-it ends, is of no matter to the recorder or to what processes.
+Everything is read from results/live (recordings/results/live.py) and the finished tosses' files. Whether this runs,
+and how it ends, is of no matter to the recorder or to what processes.
 """
 
 from __future__ import annotations
@@ -171,7 +172,8 @@ def words(tosses: Sequence[TossSoFar], lines: dict[str, str], state: str) -> str
         place = "none" if not toss.placed else "twin?" if toss.ambiguous else "sure"
         verdict = "good" if toss.good else "; ".join(toss.verdict)
         text.append(
-            f"| {toss.toss} | {toss.tracked} of {toss.frames} | {toss.interpolated} | {toss.lost} | {place} | {verdict} |"
+            f"| {toss.toss} | {toss.tracked} of {toss.frames} | {toss.interpolated} | {toss.lost} | {place} | "
+            f"{verdict} |"
         )
     return "\n".join([*text, "", f"({state})"] if state else text)
 

@@ -1,8 +1,9 @@
 """The pose of a known shape in one frame after the other, each from the frames before it alone.
 
-The frame's foreground near where the object is expected becomes a view (`sensor/view.py`), which is aligned to the shape
-drawn from all sides and to the last view by the tracker's own kernels (depth, appearance, silhouette). Two hypotheses are
-carried where the shape looks alike from two sides. What is lost is sought anew over all orientations.
+The frame's foreground near where the object is expected becomes a view (`sensor/view.py`), which is aligned to the
+shape
+drawn from all sides and to the last view by the tracker's own kernels (depth, appearance, silhouette). Two hypotheses
+are carried where the shape looks alike from two sides. What is lost is sought anew over all orientations.
 """
 
 from __future__ import annotations
@@ -20,15 +21,19 @@ from processing.motion.motion_prior import gravity_in_camera
 from processing.segment.background.foreground import ForegroundSettings, moved_pixels
 from processing.segment.background.static_scene import StaticScene
 from processing.sensor import view_layout as lay
+from processing.sensor.frames import corrected_depth
 from processing.sensor.noise import TRACK_COVARIANCE_SCALE, stereo_sigma_m
 from processing.sensor.rectification import Rectification
 from processing.sensor.view import Crop, ViewConfig, ViewStore, cut
 from processing.track.beam import BeamConfig, Hypothesis, Scene, follow
 from processing.track.known_shape import ShapeConfig, center_of, located, shape_views
-from recordings.geometry import CameraModel, Transform
+from recordings.geometry import CameraModel, Transform, skew
 from recordings.records import RgbdFrame
 from recordings.tracks import ObjectShape, Status
 
+MEASUREMENTS, SIDEWAYS = 40.0, 0.05
+"""So many samples of a view count as independent; outline and appearance hold it sideways with this share of them, to a
+pixel."""
 SLOTS = 3
 """Frames that are kept: two before the one that is looked at tell its motion."""
 
@@ -55,7 +60,8 @@ class FrontConfig:
     reach: float = 0.75
     """The object is looked for within so many of its diagonals around where it is expected."""
     least_share: float = 0.25
-    """A thing is taken for the object where it covers so much of what the object would, at its distance, at least ..."""
+    """A thing is taken for the object where it covers so much of what the object would, at its distance, at least
+    ..."""
     most_share: float = 2.5
     """... and no more than so much."""
     lost_frames: int = 2
@@ -66,8 +72,8 @@ class FrontConfig:
 
 @dataclass(frozen=True, eq=False)
 class LivePose:
-    """One frame's pose (None: lost). `covariance`: of translation and rotation, camera axes; `other`: the second
-    hypothesis, where one is left."""
+    """One frame's pose (None: lost). `covariance`: of the rotation vector (camera axes) and of the object's origin, as
+    in StampedPose; `other`: the second hypothesis, where one is left."""
 
     frame: int
     time_ns: int
@@ -83,9 +89,9 @@ class PoseFront:
 
     def __init__(
         self, camera: CameraModel, shape: ObjectShape, background: StaticScene, world_from_camera: Transform | None,
-        config: FrontConfig | None = None,
+        config: FrontConfig | None = None, depth_scale: float = 1.0,
     ) -> None:  # fmt: skip
-        self._config, self._background = config or FrontConfig(), background
+        self._config, self._background, self._scale = config or FrontConfig(), background, depth_scale
         self._rectified = Rectification.of(camera)
         self._camera_from_world = None if world_from_camera is None else world_from_camera.inverse().matrix
         self._size_m = float(np.linalg.norm(np.ptp(shape.vertices_m, axis=0)))
@@ -108,7 +114,7 @@ class PoseFront:
         return bool(self._beam)
 
     def see(self, frame: RgbdFrame) -> LivePose:
-        """The pose in this frame, from it and those before it."""
+        """The pose in this frame (depth as reported), from it and those before it."""
         time_s = frame.time_ns * 1e-9
         crop = self._crop(frame, time_s)
         if crop is None:
@@ -135,7 +141,8 @@ class PoseFront:
         mask = self._mask(frame, self._expected_m(time_s))
         if mask is None:
             return None
-        crop = cut(frame, mask, 0, self._rectified, 1.0, self._config.view, self._camera_from_world)
+        metric = replace(frame, depth_m=corrected_depth(frame.depth_m, self._scale))
+        crop = cut(metric, mask, 0, self._rectified, 1.0, self._config.view, self._camera_from_world)
         room = self._scene.store.crops[self._slot]
         return None if crop is None or room is None or crop.mask.size > self._room_px() else crop
 
@@ -163,8 +170,8 @@ class PoseFront:
             u, v = self._pixel(expected_m)
             r = round(self._config.reach * self._size_m * self._focal / expected_m[2])
             at = np.s_[max(v - r, 0) : max(v + r, 0), max(u - r, 0) : max(u + r, 0)]
-        part = RgbdFrame(frame.camera, frame.index, frame.time_ns, frame.depth_time_ns,
-                         np.ascontiguousarray(frame.color_rgb[at]), np.ascontiguousarray(frame.depth_m[at]))  # fmt: skip
+        color, depth_m = np.ascontiguousarray(frame.color_rgb[at]), np.ascontiguousarray(frame.depth_m[at])
+        part = replace(frame, color_rgb=color, depth_m=depth_m)
         if part.depth_m.size < 100:
             return None
         scene = StaticScene(**{name: np.ascontiguousarray(value[at]) for name, value in vars(self._background).items()})
@@ -204,9 +211,7 @@ class PoseFront:
             poses[slot] = start.pose
             costs, on = np.full(SLOTS, np.nan), np.full(SLOTS, np.nan)
             costs[slot], on[slot] = start.fit, start.on_surface
-            self._beam.append(
-                Hypothesis(poses, costs, on, (slot,), self._keyframes, start.fit - starts[0].fit)
-            )
+            self._beam.append(Hypothesis(poses, costs, on, (slot,), self._keyframes, start.fit - starts[0].fit))
         self._without = 0
         return self._pose(frame, slot)
 
@@ -224,7 +229,8 @@ class PoseFront:
         status: Status = "tracked"
         if other is not None:
             turn = turn_between(best.poses[slot], other.poses[slot])
-            covariance[3:, 3:] += 0.25 * np.outer(turn, turn)
+            turned = best.poses[slot, :3, :3] @ turn
+            covariance[:3, :3] += 0.25 * np.outer(turned, turned)
             status = "interpolated"
         return LivePose(frame.index, frame.time_ns, best.poses[slot].copy(), covariance, status,
                         float(best.costs[slot]), None if other is None else other.poses[slot].copy())  # fmt: skip
@@ -237,14 +243,17 @@ class PoseFront:
         center = h.poses[slot, :3, :3] @ self._scene.center_m + h.poses[slot, :3, 3]
         points, normals = samples[:, :3], samples[:, 3:6]
         sigma = stereo_sigma_m(points[:, 2].astype(np.float32)).astype(np.float64)
-        depth = np.concatenate([normals, np.cross(points - center, normals)], 1) / sigma[:, None]
+        depth = np.concatenate([np.cross(points - center, normals), normals], 1) / sigma[:, None]
         pixel = float(np.median(points[:, 2])) / self._focal
         side = np.zeros((2 * len(points), 6))
         for k in range(2):
             axis = np.eye(3)[k]
-            side[k :: 2] = np.concatenate([np.tile(axis, (len(points), 1)), np.cross(points - center, axis)], 1) / pixel
-        information = (depth.T @ depth + 0.05 * side.T @ side) / max(len(points) / 40.0, 1.0)
-        return np.asarray(TRACK_COVARIANCE_SCALE * np.linalg.inv(information + 1e-3 * np.eye(6)))
+            side[k::2] = np.concatenate([np.cross(points - center, axis), np.tile(axis, (len(points), 1))], 1) / pixel
+        information = (depth.T @ depth + SIDEWAYS * side.T @ side) / max(len(points) / MEASUREMENTS, 1.0)
+        about_center = TRACK_COVARIANCE_SCALE * np.linalg.inv(information + 1e-3 * np.eye(6))
+        origin = np.eye(6)  # from (turn, shift of the center) to (turn, shift of the origin)
+        origin[3:, :3] = -skew(h.poses[slot, :3, 3] - center)
+        return np.asarray(origin @ about_center @ origin.T)
 
 
 def _without(h: Hypothesis, slot: int) -> Hypothesis:
@@ -266,4 +275,3 @@ def _largest_crop(camera: CameraModel, view: ViewConfig) -> Crop:
     shape = (camera.height // 2, camera.width // 2)
     none = np.zeros(shape, dtype=bool)
     return Crop(0, (0, 0), none, none.astype(np.float32), np.zeros((*shape, 3), dtype=np.float32), none, None, 0.0)
-

@@ -172,8 +172,8 @@ def register_tosses(
 
 @dataclass(frozen=True, eq=False)
 class Placement:
-    """Where a toss lies among others: `shared_from_own` 4x4, its `fit` and the `gap` to the next different placement, as
-    in Registered; `joined` and `ambiguous` likewise."""
+    """Where a toss lies among others: `shared_from_own` 4x4, its `fit` and the `gap` to the next different placement,
+    as in Registered; `joined` and `ambiguous` likewise."""
 
     shared_from_own: Float[Array, "4 4"]
     fit: float
