@@ -153,6 +153,7 @@ class _Follower:
     done: dict[int, FileId] = field(default_factory=dict)
     result: Followed = field(default_factory=Followed)
     said_behind_s: float = 0.0
+    started_s: float = field(default_factory=time.time)
     side: SideWork[LawSoFar] = field(default_factory=SideWork)
 
     def until_end(self) -> Followed:
@@ -202,13 +203,13 @@ class _Follower:
         return False
 
     def _look_at(self, toss: int, file: FileId, waiting: int) -> None:
-        path, began = self.session / f"toss_{toss:02d}.mcap", time.time()
+        path = self.session / f"toss_{toss:02d}.mcap"
 
         def step(_: str) -> None:
             if finished(path) != file:
                 raise TossGone
 
-        self._state("working", toss, waiting, began - file.changed_ns / 1e9)
+        self._state("working", toss, waiting, self._waited_s(file))
         self.done[toss] = file
         try:
             joined = self.together.add(self.looker.look(toss, file, step))
@@ -225,7 +226,7 @@ class _Follower:
             self._tell(toss, joined, file)
 
     def _tell(self, toss: int, joined: Joined, file: FileId) -> None:
-        report = self.together.report(joined, time.time() - file.changed_ns / 1e9)
+        report = self.together.report(joined, self._waited_s(file))
         self.result.looked_at.append(toss)
         self._written(lambda: self.writer.toss(report))
         self._written(self._write_shape)
@@ -276,11 +277,15 @@ class _Follower:
         return False
 
     def _tell_behind(self, files: dict[int, FileId], waiting: list[int]) -> None:
-        behind_s = time.time() - min(files[t].changed_ns for t in waiting) / 1e9
+        behind_s = max(self._waited_s(files[t]) for t in waiting)
         if len(waiting) > 1 and behind_s > max(self.live.late_s, 2 * self.said_behind_s):
             self.said_behind_s = behind_s
             text = f"live: {behind_s:.0f} s behind, {len(waiting)} tosses wait; recording goes on as before"
             self._say("behind", text)
+
+    def _waited_s(self, file: FileId) -> float:
+        """Since the toss was recorded; of those that were there before, since the follower began."""
+        return time.time() - max(file.changed_ns / 1e9, self.started_s)
 
     def _state(self, state: str, toss: int | None = None, waiting: int = 0, behind_s: float = 0.0) -> None:
         self._written(lambda: self.writer.state(State(state, os.getpid(), toss, waiting, round(behind_s, 1))))

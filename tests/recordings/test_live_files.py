@@ -31,7 +31,10 @@ def test_lines_are_read_once_and_in_order(tmp_path: Path) -> None:
     writer, reader = LiveWriter(tmp_path), LineReader(tmp_path)
     writer.say("ready", "one")
     writer.say("verdict", "two", 4)
-    assert [(line.kind, line.text, line.toss) for line in reader.new()] == [("ready", "one", None), ("verdict", "two", 4)]
+    assert [(line.kind, line.text, line.toss) for line in reader.new()] == [
+        ("ready", "one", None),
+        ("verdict", "two", 4),
+    ]
     assert reader.new() == []
     writer.say("next", "three")
     assert [line.text for line in reader.new()] == ["three"]

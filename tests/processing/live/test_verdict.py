@@ -25,9 +25,11 @@ def seen(**other: object) -> Seen:
     return Seen(**{**plain, **other})  # type: ignore[arg-type]
 
 
-def said(seen_: Seen = seen(), of: ObjectTrack = track(), at: Instants = GOOD, **other: bool) -> str:
-    plain = {"judged": True, "ambiguous": False, "joined": True}
-    return "; ".join(verdict(of, seen_, at, **{**plain, **other}, config=CONFIG))
+def said(
+    shown: Seen | None = None, of: ObjectTrack | None = None, at: Instants = GOOD, judged: bool = True,
+    ambiguous: bool = False, joined: bool = True,
+) -> str:  # fmt: skip
+    return "; ".join(verdict(of or track(), shown or seen(), at, judged, ambiguous, joined, CONFIG))
 
 
 def test_nothing_is_said_of_a_good_toss() -> None:
