@@ -29,6 +29,7 @@ from processing.store import Done, Store
 from processing.track.track_toss import TossTrack, track_toss
 from recordings.errors import BadInput
 from recordings.progress import Progress
+from recordings.records import TossWindow
 from recordings.session import Session
 
 Step = Callable[[str], None]
@@ -38,13 +39,14 @@ Step = Callable[[str], None]
 @dataclass(frozen=True, eq=False)
 class Looked:
     """A toss as it was looked at, in its own object frame. `views`: some frames, as the shape so far is fused from
-    them."""
+    them; `window`: what its recorder saw of it."""
 
     toss: int
     file: FileId
     tracked: TossTrack
     seen: Seen
     views: tuple[FieldView, ...]
+    window: TossWindow
 
 
 @dataclass
@@ -80,7 +82,8 @@ class Looker:
             tracked = _track(run, toss, images)
             step("what is seen")
             seen = what_is_seen(images.frames, list(images.masks), self.live)
-            return Looked(toss, file, tracked, seen, self._views(run, tracked, images))
+            window = run.session.toss(toss).window()
+            return Looked(toss, file, tracked, seen, self._views(run, tracked, images), window)
         finally:
             session.close()
 

@@ -73,7 +73,7 @@ class Together:
         placement = place_among(looked.tracked, [j.compared for j in others], self.config.register) if others else None
         moved = _moved(looked.tracked, np.eye(4) if placement is None else placement.shared_from_own)
         inertia = np.eye(3) * 1e-3 if self.shape is None else uniform_physics(self.shape).inertia_kgm2
-        instants = instants_of(moved.track, self.world_from_camera, moved.center_m, inertia)
+        instants = instants_of(moved.track, self.world_from_camera, moved.center_m, inertia, looked.window)
         joined = Joined(
             looked=replace(looked, views=_moved_views(looked, moved.track, placement)),
             track=moved.track,

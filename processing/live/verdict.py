@@ -15,7 +15,7 @@ from processing.live.config import LiveConfig
 from processing.motion.phases import find_phases
 from recordings.constants import LUMA
 from recordings.geometry import Transform
-from recordings.records import RgbdFrame
+from recordings.records import RgbdFrame, TossWindow
 from recordings.tracks import ObjectTrack
 
 LEAST_FRAMES = 5
@@ -88,18 +88,22 @@ def _sharpness(frame: RgbdFrame, mask: Bool[Array, "h w"], motion_px: Float[Arra
 
 
 def instants_of(
-    track: ObjectTrack, world_from_camera: Transform | None, center_m: Float[Array, "3"], inertia: Float[Array, "3 3"]
-) -> Instants:
-    """Flight, impact and rest of a track; nothing where the table is not calibrated or too little was tracked."""
+    track: ObjectTrack, world_from_camera: Transform | None, center_m: Float[Array, "3"], inertia: Float[Array, "3 3"],
+    recorded: TossWindow,
+) -> Instants:  # fmt: skip
+    """Flight, impact and rest of a track; nothing where the table is not calibrated or too little was tracked. A rest
+    that the recorder saw is one, where the few frames of it that were looked at do not prove it."""
     kept = [i for i, s in enumerate(track.status) if s == "tracked"]
     if world_from_camera is None or len(kept) < LEAST_FRAMES:
         return Instants()
     series = series_of({track.toss: track}, world_from_camera)[0].about(center_m)
     phases = find_phases(series, inertia)
-    at = (
-        None if i is None else kept[min(i, len(kept) - 1)] for i in (phases.release, phases.first_impact, phases.rest)
-    )
-    return Instants(*at)
+    found = (phases.release, phases.first_impact, phases.rest)
+    release, impact, rest = (None if i is None else kept[min(i, len(kept) - 1)] for i in found)
+    if rest is None and recorded.rest_time_ns is not None:
+        seen = int(np.searchsorted(track.time_ns, recorded.rest_time_ns))
+        rest = seen if seen < len(track.time_ns) else None
+    return Instants(release, impact, rest)
 
 
 def verdict(
