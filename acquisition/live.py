@@ -13,12 +13,14 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import IO
+from typing import IO, Protocol, runtime_checkable
 
+from acquisition.devices import Image
 from acquisition.operator import Operator
-from acquisition.streaming.recorder import Recorder
+from acquisition.streaming.recorder import Look
 from recordings.errors import BadInput
 from recordings.live_frames import FrameBoardWriter, LiveFrame, memory_folder
 from recordings.results.live import LineReader, live_folder, read_state
@@ -28,6 +30,18 @@ CAMERA = "d455"
 FAR_APART_NS = 20_000_000
 FOLLOWER, VIEWER = "processing.cli", "recordings.cli_view"
 NO_DISPLAY = "live: there is no display here; elsewhere on this machine: toss-view --live {session}"
+
+
+@runtime_checkable
+class Records(Protocol):
+    """What is asked of a recorder: the take that it writes now, and what came last."""
+
+    @property
+    def take(self) -> object | None: ...
+    @property
+    def latest(self) -> Mapping[str, Image]: ...
+    @property
+    def looks(self) -> Sequence[Look]: ...
 
 
 def require_follower() -> None:
@@ -42,7 +56,7 @@ class LiveSession:
     """The follower of a session that is being recorded, and the viewer. As a context: the lines are read until its end;
     the follower itself goes on, to make the session's results."""
 
-    def __init__(self, session: Path, operator: Operator, recorder: Recorder, pose: bool = False) -> None:
+    def __init__(self, session: Path, operator: Operator, recorder: Records, pose: bool = False) -> None:
         self._session, self._operator, self._recorder, self._pose = session, operator, recorder, pose
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._listen, name="live", daemon=True)
@@ -124,7 +138,7 @@ class LiveSession:
 class FrameFeed:
     """The newest colour and depth image for the live pose, from a thread that may be slow. As a context."""
 
-    def __init__(self, recorder: Recorder) -> None:
+    def __init__(self, recorder: Records) -> None:
         self._recorder = recorder
         self.path = memory_folder() / f"toss-record-{os.getpid()}-frames"
         self._stop = threading.Event()
@@ -151,7 +165,7 @@ class FrameFeed:
                         board.put(frame)
 
 
-def newest_frame(recorder: Recorder) -> LiveFrame | None:
+def newest_frame(recorder: Records) -> LiveFrame | None:
     """Colour and depth that were received together last, with the session times that they have by now."""
     looks = recorder.looks
     color, depth = (recorder.latest.get(f"/{CAMERA}/{stream}") for stream in ("color", "depth"))
