@@ -198,7 +198,7 @@ class PoseFront:
         if len(seen) < self._config.view.least_samples:
             return False
         expected_px = (0.6 * self._size_m * self._focal / float(np.median(seen))) ** 2
-        return self._config.least_share < thing.sum() / expected_px < self._config.most_share
+        return bool(self._config.least_share < thing.sum() / expected_px < self._config.most_share)
 
     def _sought(self, frame: RgbdFrame, slot: int) -> LivePose:
         """All orientations; the best two that differ are carried on."""
