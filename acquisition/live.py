@@ -20,7 +20,7 @@ from typing import IO, Protocol, runtime_checkable
 
 from acquisition.devices import Image
 from acquisition.operator import Operator
-from acquisition.streaming.recorder import Look
+from acquisition.streaming.recorder import DepthThumbnail
 from recordings.errors import BadInput
 from recordings.live_frames import FrameBoardWriter, LiveFrame, memory_folder
 from recordings.results.live import LineReader, live_folder, read_state
@@ -41,7 +41,7 @@ class Records(Protocol):
     @property
     def latest(self) -> Mapping[str, Image]: ...
     @property
-    def looks(self) -> Sequence[Look]: ...
+    def thumbnails(self) -> Sequence[DepthThumbnail]: ...
 
 
 def require_follower() -> None:
@@ -167,16 +167,18 @@ class FrameFeed:
 
 def newest_frame(recorder: Records) -> LiveFrame | None:
     """Colour and depth that were received together last, with the session times that they have by now."""
-    looks = recorder.looks
+    thumbnails = recorder.thumbnails
     color, depth = (recorder.latest.get(f"/{CAMERA}/{stream}") for stream in ("color", "depth"))
-    if color is None or depth is None or not looks or looks[-1].number != depth.number:
+    if color is None or depth is None or not thumbnails or thumbnails[-1].number != depth.number:
         return None
-    depth_ns = looks[-1].time_ns
+    depth_ns = thumbnails[-1].time_ns
     apart_ns = color.mid_exposure_ns - depth.mid_exposure_ns
     if abs(apart_ns) > FAR_APART_NS:  # of two frames, one of which is not there yet
         return None
     host_ns = max(color.host_ns, depth.host_ns)
-    return LiveFrame(color.number, depth_ns + apart_ns, depth_ns, host_ns, color.pixels, depth.pixels, looks[-1].unit_m)
+    return LiveFrame(
+        color.number, depth_ns + apart_ns, depth_ns, host_ns, color.pixels, depth.pixels, thumbnails[-1].unit_m
+    )
 
 
 def has_display() -> bool:

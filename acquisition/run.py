@@ -18,17 +18,17 @@ from acquisition.arm.toss import TossPlan
 from acquisition.detect import Eye, TossEvents
 from acquisition.disk import check_disk, expected_bytes_s
 from acquisition.interrupts import Interrupts
+from acquisition.judge import judge
 from acquisition.operator import Operator
 from acquisition.streaming.recorder import Recorder, thumbnail_stride
 from acquisition.streaming.sequence_check import Trouble
 from acquisition.streaming.streams import Tally
 from acquisition.take import PLAYED, POLL_S, AtTheRig, WatchedTake
-from acquisition.judge import judge
 from acquisition.verdict import Verdict
 from recordings.errors import WriteFailed
+from recordings.mcap.toss_writer import TossWriter
 from recordings.progress import Progress
 from recordings.records import HealthLine, TossEvent
-from recordings.mcap.toss_writer import TossWriter
 from recordings.session_writer import SessionWriter, toss_name
 from recordings.tracks import RigCalibration
 

@@ -33,8 +33,8 @@ from recordings.progress import Progress
 from recordings.results.folder import write_shape
 from recordings.results.live import Kind, LiveWriter, State, live_folder
 from recordings.session import Session
-from recordings.session_writer import write_json
 from recordings.tracks import RigCalibration
+from recordings.whole_file import write_json
 
 NO_TABLE = (
     "the table is not calibrated: neither flight nor rest nor friction is judged, only masks, tracks and the shape; "

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from processing.contact.friction.estimate import PROFILE, courses_of, friction_by_forecasts
+from processing.contact.friction.estimate import PROFILE, friction_by_forecasts, observed_trajectories
 from processing.contact.friction.forecast import RigidBody
 from processing.contact.learn.shape_comparison import series_of
 from processing.contact.physics.inertia import uniform_physics
@@ -53,7 +53,7 @@ def law_so_far(
 ) -> LawSoFar | None:
     """From tracks in the shape's object frame; None where too few of them hit the table."""
     body, series, smoothed = _prepared(tracks, shape, world_from_camera, calibration)
-    hit = [s.toss for s, m in zip(series, smoothed) if courses_of([s], [m])]
+    hit = [s.toss for s, m in zip(series, smoothed) if observed_trajectories([s], [m])]
     found = friction_by_forecasts(body, series, smoothed)
     if found is None:
         return None

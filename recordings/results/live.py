@@ -20,7 +20,7 @@ from typing import Any, Literal
 
 from recordings.bounded.documents import read_json
 from recordings.errors import BadInput, TosslabError
-from recordings.session_writer import write_json
+from recordings.whole_file import write_json
 
 FOLDER = "live"
 Kind = Literal["ready", "verdict", "next", "learned", "behind", "fault", "left out", "done"]

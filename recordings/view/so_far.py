@@ -152,7 +152,7 @@ class SessionView:
 
 def show_live(session: Path, screenshot: Path | None = None, waited: Callable[[], None] | None = None) -> Path | None:
     """The viewer until its window is closed, or one picture of what is known now. Raises BadInput, ViewerFailed."""
-    from recordings.session_writer import write_bytes
+    from recordings.whole_file import write_bytes
 
     with SessionView(session, headless=screenshot is not None) as view:
         if screenshot is None:

@@ -18,7 +18,7 @@ from acquisition.cli import main, with_live
 from acquisition.devices import Image, Stamp
 from acquisition.live import LiveSession, newest_frame
 from acquisition.operator import Nobody
-from acquisition.streaming.recorder import Look
+from acquisition.streaming.recorder import DepthThumbnail
 from recordings.results.live import LiveWriter
 
 
@@ -49,7 +49,7 @@ def sleeper(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
 
 
 def test_lines_wait_for_the_end_of_a_take_and_a_killed_follower_is_said(sleeper: Path) -> None:
-    operator, recorder = Listening(), SimpleNamespace(take="one", latest={}, looks=deque())
+    operator, recorder = Listening(), SimpleNamespace(take="one", latest={}, thumbnails=deque())
     with LiveSession(sleeper / "session", operator, recorder) as session:
         LiveWriter(sleeper / "session").say("verdict", "toss 0: good", 0)
         time.sleep(3 * live.POLL_S)
@@ -63,7 +63,9 @@ def test_lines_wait_for_the_end_of_a_take_and_a_killed_follower_is_said(sleeper:
 
 
 def test_a_follower_has_a_session_of_its_own_so_that_ctrl_c_does_not_reach_it(sleeper: Path) -> None:
-    with LiveSession(sleeper / "session", Listening(), SimpleNamespace(take=None, latest={}, looks=deque())) as session:
+    with LiveSession(
+        sleeper / "session", Listening(), SimpleNamespace(take=None, latest={}, thumbnails=deque())
+    ) as session:
         assert session._follower is not None
         assert os.getsid(session._follower.pid) == session._follower.pid
         session._follower.kill()
@@ -89,8 +91,8 @@ def image(stream: str, number: int, device_ns: int, host_ns: int) -> Image:
 
 def test_the_newest_frame_has_the_session_times_of_its_images() -> None:
     color, depth = image("color", 7, 1_000_000, 5_000), image("depth", 7, 1_004_000, 6_000)
-    look = Look(6_000, 900_000, 7, depth.pixels, 0.001)
-    recorder = SimpleNamespace(take=None, latest={"/d455/color": color, "/d455/depth": depth}, looks=deque([look]))
+    look = DepthThumbnail(6_000, 900_000, 7, depth.pixels, 0.001)
+    recorder = SimpleNamespace(take=None, latest={"/d455/color": color, "/d455/depth": depth}, thumbnails=deque([look]))
     found = newest_frame(recorder)
     assert found is not None
     assert (found.time_ns, found.depth_time_ns, found.host_ns) == (896_000, 900_000, 6_000)

@@ -14,9 +14,10 @@ from pathlib import Path
 import numpy as np
 
 from processing.live.pose.front import LivePose
+from recordings.mcap.toss_writer import TossWriter
 from recordings.records import StampedPose
-from recordings.session_writer import TossWriter, write_json
 from recordings.tracks import RigCalibration
+from recordings.whole_file import write_json
 
 LOOPBACK = "127.0.0.1"
 TOPIC = "/live/pose"
