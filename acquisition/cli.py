@@ -9,6 +9,8 @@ from pathlib import Path
 
 from recordings.console import Outcome, command_parser, run_command
 
+LIVE = ("toss", "pose")
+
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point of toss-record."""
@@ -17,6 +19,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         "Record tosses into a session folder: preflight, countdown, take, verdict, one file per toss.",
         "toss-record --rig synthetic --tosses 3 --yes sessions/first",
         "toss-record --rig lab.toml --tosses 10 --object jack",
+        "toss-record --rig lab.toml --tosses 10 --live sessions/jack",
         "toss-record --rig lab.toml --speed 0.1 sessions/rehearsal",
         "toss-record --rig lab.toml --calibration board sessions/calibration",
         "toss-record --rig replay:sessions/first --yes sessions/again",
@@ -40,11 +43,29 @@ def main(argv: Sequence[str] | None = None) -> int:
         help="a real arm moves and tosses at F times its speed (0 to 1)",
     )
     parser.add_argument("--preview", action="store_true", help="show the devices live in rerun")
+    parser.add_argument(
+        "--live",
+        nargs="?",
+        const=LIVE[0],
+        choices=LIVE,
+        help="look at each toss when it is recorded, say what to throw next; `pose`: its pose while it flies, too",
+    )
     parser.add_argument("--dry-run", action="store_true", help="plan and check the tosses; nothing moves or is written")
     parser.add_argument("--between", action="store_true", help="keep the frames between the tosses too")
     parser.add_argument("--doctor", action="store_true", help="what is installed, found and missing, and the fix")
     parser.set_defaults(work=_work)
-    return run_command(parser, argv)
+    return run_command(parser, with_live(sys.argv[1:] if argv is None else argv))
+
+
+def with_live(argv: Sequence[str]) -> list[str]:
+    """The arguments with the value of `--live` bound to it: what follows it is its value only where it is one."""
+    out = list(argv)
+    for i in reversed([i for i, argument in enumerate(out) if argument == "--live"]):
+        if i + 1 < len(out) and out[i + 1] in LIVE:
+            out[i : i + 2] = [f"--live={out[i + 1]}"]
+        else:
+            out[i] = f"--live={LIVE[0]}"
+    return out
 
 
 def _work(args: argparse.Namespace) -> Outcome:

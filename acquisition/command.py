@@ -17,6 +17,7 @@ from typing import Any
 
 from acquisition.arm.throw import Thrower
 from acquisition.interrupts import Interrupts
+from acquisition.live import LiveSession, require_follower
 from acquisition.operator import Keyboard, Nobody, Operator, Unattended, single_keys
 from acquisition.preflight import Preflight, of_recording, preflight
 from acquisition.ready_rig import Setup
@@ -40,6 +41,8 @@ def run(args: argparse.Namespace) -> Outcome:
         return _doctor(args.out or Path())
     if args.tosses < 1:
         raise BadInput(f"--tosses {args.tosses}; wanted 1 or more")
+    if args.live:
+        _refuse_live(args)
     setup = set_up(args.rig)
     if args.between:
         config = replace(setup.rig.recording, between_tosses=True)
@@ -52,20 +55,25 @@ def run(args: argparse.Namespace) -> Outcome:
     check_folder(out, args.resume)
     check_room(out, setup.rig.recording.reserve_gb)
     with Interrupts() as interrupts, single_keys(sys.stdin):
-        report, checks = _record(args, setup, out, operator, interrupts)
+        report, checks, live = _record(args, setup, out, operator, interrupts)
     if setup.lab is not None and report.takes:
         from acquisition.synthetic.truth_sidecar import write_beside
 
         write_beside(setup.lab, out)
-    return outcome(report, checks)
+    if live is None:
+        return outcome(report, checks)
+    live.wait()
+    done = outcome(report, checks)
+    return replace(done, document={**done.document, "live": live.document()})
 
 
 def _record(
     args: argparse.Namespace, setup: Setup, out: Path, operator: Operator, interrupts: Interrupts
-) -> tuple[SessionReport, Preflight]:
+) -> tuple[SessionReport, Preflight, LiveSession | None]:
     first = next_toss(out) if args.resume else 0
     clock = new_clock(out)
     recorder = Recorder(setup.rig, setup.devices, clock)
+    live: LiveSession | None = None
     with contextlib.ExitStack() as open_things:
         if setup.lab is not None and args.calibration:
             show = setup.lab.show
@@ -93,6 +101,9 @@ def _record(
 
             report = record_views(recorder, session, setup, args.calibration, operator, interrupts)
         else:
+            if args.live:
+                live = LiveSession(out, operator, recorder, pose=args.live == "pose")
+                open_things.enter_context(live)
             session_run = SessionRun(
                 recorder, thrower, session, setup.calibration, operator, progress_for("preparing"), interrupts
             )
@@ -101,7 +112,14 @@ def _record(
             session.finish("complete" if not report.stopped else "stopped", report.stopped)
     for trouble in recorder.troubles():
         operator.say(f"{trouble.device}: {trouble.kind}: {trouble.text}")
-    return report, checks
+    return report, checks, live
+
+
+def _refuse_live(args: argparse.Namespace) -> None:
+    """Raises BadInput where --live cannot be."""
+    require_follower()
+    if args.calibration:
+        raise BadInput(f"--live looks at tosses; --calibration {args.calibration} records none: leave one of them out")
 
 
 def _doctor(folder: Path) -> Outcome:

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from numpy import ndarray as Array
 
 from acquisition.devices import Image, RgbdCamera
-from acquisition.run import expected_bytes_s
+from acquisition.disk import expected_bytes_s
 from acquisition.streaming.recorder import Recorder
 from acquisition.streaming.streams import Tally
 from recordings.tracks import RigCalibration

@@ -1,4 +1,3 @@
-# long because: a take from its plan to its verdict, on one screen after another
 """Recording a session: toss after toss into one folder, each with its verdict; nothing lost in silence.
 
 report = record_session(recorder, thrower, session, options, operator)
@@ -6,43 +5,34 @@ report = record_session(recorder, thrower, session, options, operator)
 
 from __future__ import annotations
 
-import shutil
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from acquisition.arm.asked import count_down, stopped
+from acquisition.arm.asked import count_down
 from acquisition.arm.limits import arm_model
-from acquisition.arm.throw import Throw, Thrower
+from acquisition.arm.throw import Thrower
 from acquisition.arm.toss import TossPlan
-from acquisition.detect import Eye, TossEvents, TossWatcher
-from acquisition.devices import Arm, DeviceLost, DeviceRefused, Gripper
+from acquisition.detect import Eye, TossEvents
+from acquisition.disk import check_disk, expected_bytes_s
 from acquisition.interrupts import Interrupts
 from acquisition.judge import judge
 from acquisition.operator import Operator
 from acquisition.streaming.recorder import Recorder, thumbnail_stride
 from acquisition.streaming.sequence_check import Trouble
 from acquisition.streaming.streams import Tally
+from acquisition.take import PLAYED, POLL_S, AtTheRig, WatchedTake
 from acquisition.verdict import Verdict
-from recordings.errors import TosslabError, WriteFailed
+from recordings.errors import WriteFailed
 from recordings.mcap.toss_writer import TossWriter
 from recordings.progress import Progress
-from recordings.records import HealthLine, TossCommand, TossEvent
+from recordings.records import HealthLine, TossEvent
 from recordings.session_writer import SessionWriter, toss_name
 from recordings.tracks import RigCalibration
 
-POLL_S = 0.02
 SLOW_S = 2.0
-WAITS_AFTER_S = 4.0
-"""After so long a take that does not end says what it waits for, and again after as long."""
-PLAYED = "end of the recording"
-ENDS_TAKE = ("lost", "silent", "reflex", "user_stopped", "error", "disk", "fault", "motion")
-
-
-class DiskFull(TosslabError):
-    """The next toss does not fit."""
 
 
 @dataclass(frozen=True)
@@ -110,6 +100,7 @@ class SessionRun:
         self.eye = make_eye(recorder, calibration)
         self._rate_bytes_s = expected_bytes_s(recorder)
         self._silent: set[str] = set()
+        self._at = AtTheRig(recorder, thrower, operator, self.config, self.eye, session.folder, self.watch_silence)
         self._ended_host_ns: int | None = None
 
     def record(self, options: Options) -> SessionReport:
@@ -160,7 +151,7 @@ class SessionRun:
     def _take(self, toss: int, plan: TossPlan | None, fixed_s: float | None, opened: Opened | None) -> TossReport:
         opened = opened or self._open(toss)
         writer, before = opened.writer, opened.before
-        take = _Running(self, plan, fixed_s)
+        take = WatchedTake(self._at, plan, fixed_s)
         try:
             take.throw()
             ended_by = take.watch()
@@ -190,7 +181,7 @@ class SessionRun:
         self,
         toss: int,
         writer: TossWriter,
-        take: _Running,
+        take: WatchedTake,
         events: TossEvents,
         troubles: Sequence[Trouble],
         verdict: Verdict,
@@ -207,7 +198,7 @@ class SessionRun:
             return Verdict("reject", (str(refused),)), "reject"
         return verdict, "accept"
 
-    def _keep_interrupted(self, toss: int, writer: TossWriter, take: _Running, before: Mapping[str, Tally]) -> None:
+    def _keep_interrupted(self, toss: int, writer: TossWriter, take: WatchedTake, before: Mapping[str, Tally]) -> None:
         """Everything so far stays, as a whole file that says so."""
         take.halt()
         try:
@@ -246,7 +237,7 @@ class SessionRun:
                 writer.dropped(topic, tally.dropped_total)
 
     def _write_story(
-        self, writer: TossWriter, take: _Running, events: TossEvents, troubles: Sequence[Trouble], verdict: Verdict
+        self, writer: TossWriter, take: WatchedTake, events: TossEvents, troubles: Sequence[Trouble], verdict: Verdict
     ) -> None:
         """The command, the events, the health lines and the verdict, into the toss's file."""
         now_ns = self.recorder.clock.session_ns(time.monotonic_ns())
@@ -260,7 +251,7 @@ class SessionRun:
             writer.event(event)
         writer.event(TossEvent(now_ns, "verdict", "toss-record", verdict.text()))
 
-    def _info(self, verdict: Verdict, take: _Running, ended_by: str) -> dict[str, Any]:
+    def _info(self, verdict: Verdict, take: WatchedTake, ended_by: str) -> dict[str, Any]:
         return {
             "verdict": verdict.text(),
             "warnings": list(verdict.warnings),
@@ -285,170 +276,6 @@ class SessionRun:
         return found
 
 
-class _Running:
-    """A take while it is recorded."""
-
-    def __init__(self, run: SessionRun, plan: TossPlan | None, fixed_s: float | None) -> None:
-        self._run, self._plan, self._fixed_s = run, plan, fixed_s
-        self.watcher = TossWatcher(by_hand=not run.recorder.rig.of_kind("gripper"))
-        self.troubles: list[Trouble] = []
-        self.notes: list[TossEvent] = []
-        self.began_s = time.monotonic()
-        self.seconds = 0.0
-        self.write_failure = ""
-        self.waited_for = ""
-        """Of a take that was cut at the longest time: what had not happened."""
-        self._throw: Throw | None = None
-        before_ns = time.monotonic_ns() - round(run.config.pre_trigger_s * 1e9)
-        self._seen_look_ns = self._seen_width_ns = before_ns
-        still = [look for look in list(run.recorder.thumbnails) if look.host_ns > before_ns]
-        if run.eye is not None and still:
-            run.eye.learn([look.raw for look in still], still[-1].unit_m)
-
-    def throw(self) -> None:
-        """Set the arm going, where there is a plan."""
-        devices = self._run.recorder.devices.values()
-        arm = next((d for d in devices if isinstance(d, Arm)), None)
-        if self._plan is None or arm is None:
-            return
-        gripper = next((d for d in devices if isinstance(d, Gripper)), None)
-        toss = self._run.recorder.rig.toss
-        opening = (toss.open_width_m, toss.open_speed_m_s) if toss is not None else (0.08, 0.1)
-        self._throw = Throw(arm, gripper, self._plan, *opening)
-        try:
-            self._throw.start()
-        except (DeviceRefused, DeviceLost) as refused:
-            self.troubles.append(Trouble(time.monotonic_ns(), "arm", "motion", str(refused), "error"))
-
-    def halt(self) -> None:
-        if self._throw is not None:
-            self._throw.halt()
-
-    def watch(self) -> str:
-        """Stay until the toss is over; returns what ended the take."""
-        run, config = self._run, self._run.config
-        rested_s: float | None = None
-        say_s = time.monotonic() + WAITS_AFTER_S
-        while True:
-            time.sleep(POLL_S)
-            now_s = time.monotonic()
-            self.seconds = now_s - self.began_s
-            if run.thrower.over():
-                self._look()
-                return PLAYED
-            why = self._trouble() or self._key() or self._disk()
-            if why:
-                self.halt()
-                return why
-            self._look()
-            if self._fixed_s is not None:
-                if self.seconds >= self._fixed_s:
-                    return "time"
-                continue
-            session_s = run.recorder.clock.session_ns(time.monotonic_ns()) / 1e9
-            if rested_s is None and self.watcher.over(session_s) and (self._throw is None or self._throw.over()):
-                rested_s = now_s
-            if rested_s is not None and now_s - rested_s >= config.after_rest_s:
-                return "rest"
-            if rested_s is None and now_s > say_s:
-                run.operator.say(f"still recording after {self.seconds:.0f} s: {self.waits_for()}. x: stop")
-                say_s = now_s + WAITS_AFTER_S
-            if self.seconds > config.longest_toss_s:
-                self.halt()
-                self.waited_for = self.waits_for()
-                return "longest toss"
-
-    def waits_for(self) -> str:
-        """Why the take goes on, in words."""
-        if self._throw is not None and not self._throw.over():
-            return "the arm still moves"
-        if self._run.eye is None:
-            return "no calibrated depth camera watches the object, so that its rest is not seen"
-        now_s = self._run.recorder.clock.session_ns(time.monotonic_ns()) / 1e9
-        return self.watcher.waits_for(now_s)
-
-    def _trouble(self) -> str:
-        fresh = self._run.recorder.troubles() + self._run.watch_silence()
-        if self._throw is not None:
-            fresh += self._throw.troubles()
-        self.troubles += fresh
-        for trouble in fresh:
-            self._run.operator.say(f"{trouble.device}: {trouble.kind}: {trouble.text}")
-        return next((t.kind for t in fresh if t.level == "error" and t.kind in ENDS_TAKE), "")
-
-    def _key(self) -> str:
-        """Any key stops an arm that moves; else what the key says."""
-        if self._throw is not None and not self._throw.over():
-            return "stop key" if stopped(self._run.operator) else ""
-        key = self._run.operator.key()
-        if key == "note":
-            now_ns = self._run.recorder.clock.session_ns(time.monotonic_ns())
-            self.notes.append(TossEvent(now_ns, "note", "operator", self._run.operator.note()))
-        if key == "quit":
-            raise KeyboardInterrupt
-        return "stop key" if key in ("stop", "reject", "redo", "accept") else ""
-
-    def _disk(self) -> str:
-        take = self._run.recorder.take
-        if take is not None and take.failed:
-            self.write_failure = take.failed
-            return "disk"
-        free = shutil.disk_usage(self._run.session.folder).free
-        if free < self._run.config.reserve_gb * 1e9 / 2:
-            self.write_failure = f"the disk ran down to {free / 1e9:.2f} GB"
-            return "disk"
-        return ""
-
-    def _look(self) -> None:
-        """Feed the watcher with what came since the last time."""
-        run, recorder = self._run, self._run.recorder
-        for sample in [s for s in list(recorder.widths) if s.host_ns > self._seen_width_ns]:
-            self._seen_width_ns = sample.host_ns
-            self.watcher.width(recorder.clock.session_ns(sample.host_ns) / 1e9, sample.width_m)
-        if run.eye is None:
-            return
-        for look in [k for k in list(recorder.thumbnails) if k.host_ns > self._seen_look_ns]:
-            self._seen_look_ns = look.host_ns
-            q = recorder.joints_at(look.host_ns)
-            near = self.watcher.expected_m(look.time_ns / 1e9, run.eye.tool_m(q))
-            self.watcher.saw(run.eye.see(look.time_ns / 1e9, look.raw, look.unit_m, q, near))
-
-    def command(self) -> TossCommand | None:
-        """What the arm was asked, for the file."""
-        started = self._throw.started_host_ns if self._throw is not None else None
-        if self._plan is None or started is None:
-            return None
-        clock = self._run.recorder.clock
-        start_ns = clock.session_ns(started)
-        return TossCommand(
-            start_ns,
-            start_ns + round(self._plan.release_s * 1e9),
-            self._plan.world_from_tool.matrix,
-            self._plan.linear_velocity_world_m_s,
-            self._plan.angular_velocity_world_rad_s,
-        )
-
-    def gripper_story(self) -> dict[str, Any]:
-        """Command sent, acknowledged, first movement: the release delay of this toss."""
-        if self._throw is None or self._throw.sent_host_ns is None:
-            return {}
-        clock, command = self._run.recorder.clock, self._throw.command()
-        sent_ns = clock.session_ns(self._throw.sent_host_ns)
-        story: dict[str, Any] = {"sent_session_ns": sent_ns}
-        if command is not None and command.acknowledged_host_ns is not None:
-            story["acknowledged_session_ns"] = clock.session_ns(command.acknowledged_host_ns)
-        released = self.watcher.released
-        if released is not None:
-            story["release_delay_s"] = released.time_s - sent_ns / 1e9
-        return story
-
-    def motion_story(self) -> dict[str, Any]:
-        if self._throw is None:
-            return {}
-        motion = self._throw.motion()
-        return {"status": motion.status, "reason": motion.reason, "ticks": motion.ticks, "missed": motion.missed}
-
-
 def make_eye(recorder: Recorder, calibration: RigCalibration) -> Eye | None:
     """What watches the depth camera; None where the calibration does not say where it stands."""
     rgbd = next((d for d in recorder.rig.devices if d.kind == "rgbd"), None)
@@ -465,37 +292,3 @@ def make_eye(recorder: Recorder, calibration: RigCalibration) -> Eye | None:
         arm_model(robot) if robot is not None else None,
         calibration.find("world", "base"),
     )
-
-
-JPEG_SHARE, LOSSLESS_SHARE, DEPTH_SHARE = 0.25, 0.75, 0.4
-ARM_BYTES_S = 400_000
-
-
-def expected_bytes_s(recorder: Recorder) -> float:
-    """Bytes per second on the disk, from the pictures that flow."""
-    total = 0.0
-    lossless = recorder.rig.recording.mono_encoding == "lossless"
-    for topic, queue in recorder.queues.items():
-        image = recorder.latest.get(topic)
-        if image is None:
-            total += ARM_BYTES_S if "arm" in topic else 0
-            continue
-        share = DEPTH_SHARE if topic.endswith("depth") else JPEG_SHARE
-        if lossless and topic.endswith("/image"):
-            share = LOSSLESS_SHARE
-        total += image.pixels.nbytes * share * queue.rate_hz
-    return total
-
-
-def check_disk(folder: Path, bytes_s: float, longest_s: float, reserve_gb: float) -> None:
-    """Raises DiskFull unless twice the longest toss and the reserve fit."""
-    place = folder
-    while not place.exists():
-        place = place.parent
-    free, wanted = shutil.disk_usage(place).free, 2 * bytes_s * longest_s + reserve_gb * 1e9
-    if free < wanted:
-        raise DiskFull(
-            f"{place} has {free / 1e9:.2f} GB free; a toss of {longest_s:g} s at {bytes_s / 1e6:.0f} MB/s and the "
-            f"reserve want {wanted / 1e9:.2f} GB. Free some space, choose another folder, or lower "
-            "[recording] longest_toss_s or reserve_gb in the rig file"
-        )

@@ -50,6 +50,7 @@ def _parser() -> Parser:
         "A run that was stopped goes on where it was: finished stages are read, not run again.",
         "toss-process                                          # the shipped sample",
         "toss-process sessions/cube --out results/cube --truth recordings/cube_dev_truth",
+        "toss-process --follow sessions/first                   # while another program records it",
     )
     parser.usage = "toss-process [SESSION ...] [--toss I-J] [--out DIR] [--truth DIR] [--model RESULTS] [more, below]"
     _add_everyday(parser)
@@ -78,6 +79,16 @@ def _add_everyday(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--truth", metavar="DIR", type=Path, help="truth/ or a *_truth folder, opened for scores only")
     parser.add_argument("--model", metavar="RESULTS", type=Path, help="track with a shape that was learned before")
+    parser.add_argument(
+        "--follow",
+        metavar="SESSION",
+        type=Path,
+        help="look at each toss while the session is recorded, then process it",
+    )
+    parser.add_argument(
+        "--recorder", type=int, help=argparse.SUPPRESS
+    )  # the process that records, of toss-record --live
+    parser.add_argument("--live-pose", type=Path, help=argparse.SUPPRESS)  # its frames, of toss-record --live pose
     parser.add_argument(
         "--table-from-depth", action="store_true", help="where the calibration lacks the table: take it from depth"
     )
@@ -123,6 +134,8 @@ def _work(args: argparse.Namespace) -> Outcome:
     if name != CONTACT_ONLY:
         rows_of(name, args.scope)  # refuses by name, before anything is read
         _refuse_what_is_not_there(args)
+    if args.follow is not None:
+        return _follow(args, name)
     sessions = [_session_path(s) for s in args.sessions] or [_sample_path()]
     if len(sessions) > 1 and args.truth is not None:
         raise BadInput("--truth DIR belongs to one session; with several, each one's own truth/ is used")
@@ -154,6 +167,24 @@ def _engine(args: argparse.Namespace, first: Path) -> Iterator[Engine]:
     else:
         with SideBySide([Worker(board) for _ in range(jobs)], board) as engine:
             yield engine
+
+
+def _follow(args: argparse.Namespace, name: str) -> Outcome:
+    """Every toss as it comes; then the session as if it had been asked for."""
+    from processing.live.command import follow_session
+
+    if args.live_pose is not None:
+        from processing.live.pose.command import serve_poses
+
+        return serve_poses(args.follow, args.live_pose, args.recorder)
+    if args.sessions:
+        raise BadInput(f"--follow {args.follow} follows one session; leave out {', '.join(args.sessions)}")
+
+    def whole() -> Outcome:
+        with _engine(args, args.follow) as engine:
+            return _process(args, engine, args.follow, name, several=False)
+
+    return follow_session(args.follow, args.recorder, config_of(args), _sample_path(), whole)
 
 
 def _many(args: argparse.Namespace, engine: Engine, sessions: Sequence[Path], name: str) -> Outcome:
@@ -353,3 +384,7 @@ def chosen_tosses(given: str | None, there: Sequence[int]) -> list[int]:
     if not chosen:
         raise BadInput(f"--toss {given}: the session has the tosses {', '.join(map(str, there)) or '(none)'}")
     return chosen
+
+
+if __name__ == "__main__":
+    sys.exit(main())

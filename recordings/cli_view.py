@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,6 +18,7 @@ EXAMPLES = (
     "toss-view sessions/cube",
     "toss-view sessions/cube/toss_03.mcap --screenshot toss_03.png",
     "toss-view sessions/cube/results --variant ours --save cube.rrd",
+    "toss-view --live sessions/first",
 )
 
 
@@ -35,12 +37,18 @@ def main(argv: Sequence[str] | None = None) -> int:
         "--variant", metavar="NAME", help="only this variant of the results (default: all, one visible)"
     )
     parser.add_argument("--scope", choices=("one", "all"), help="only this scope of the results")
+    parser.add_argument(
+        "--live", action="store_true", help="what is known of a session while it is recorded, until the window "
+        "is closed"
+    )
     parser.set_defaults(work=_work)
     return run_command(parser, argv)
 
 
 def _work(args: argparse.Namespace) -> Outcome:
     _check_names(args)
+    if args.live:
+        return _live(args)
     from recordings.view import draw as view
 
     choice = view.Choice(args.toss, args.variant, args.scope)
@@ -61,8 +69,21 @@ def _work(args: argparse.Namespace) -> Outcome:
     return Outcome(document, "\n".join([*lines, *([said] if said else [])]))
 
 
+def _live(args: argparse.Namespace) -> Outcome:
+    if args.save is not None:
+        raise Usage("--live shows what changes; leave out --save, or save the session afterwards")
+    from recordings.view.so_far import show_live
+
+    written = show_live(args.path, args.screenshot)
+    return Outcome({"path": args.path, "screenshot": written}, "" if written is None else f"wrote {written}")
+
+
 def _check_names(args: argparse.Namespace) -> None:
     """Wrong names are refused before minutes of work, not after."""
     for option, file, suffix in (("--save", args.save, ".rrd"), ("--screenshot", args.screenshot, ".png")):
         if file is not None and file.suffix.lower() != suffix:
             raise Usage(f"{option} writes a {suffix} file; found {file}, wanted {file.with_suffix(suffix).name}")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -7,7 +7,8 @@
     with player.camera("d455") as camera: frame = camera.read(0.1)
 
 Frames carry the session's own times as stamps of a clock named "session" and are received when they were, counted
-from the moment of `play`. Frame numbers go on growing from toss to toss.
+from the moment of `play`. Between two tosses the clock goes on by the time that passed since, and frame numbers go on
+by one: what was not recorded between them is no loss.
 """
 
 from __future__ import annotations
@@ -87,6 +88,12 @@ class Player:
         self._starts_ns = 0
         self._ends_ns = 0
         self._next_number: dict[str, int] = {}
+        self._clock: tuple[int, int] | None = None
+        """When the first toss was begun (host), and what its session clock said then."""
+        self._played_ns = 0
+        """On that clock since then: played as fast as it is read, more than passed."""
+        self.later_ns = 0
+        """Added to the times of the toss that is played."""
         first = session.toss(session.tosses[0])
         self.cameras = first.cameras()
         self.has_depth = len(first.depth()) > 0
@@ -108,6 +115,10 @@ class Player:
         with self._lock:
             self._tracks = shifted
             self._starts_ns = time.monotonic_ns() + round(LEAD_S * 1e9)
+            self._clock = self._clock or (self._starts_ns, first_ns)
+            passed_ns = max(self._starts_ns - self._clock[0], self._played_ns)
+            self.later_ns = passed_ns - (first_ns - self._clock[1])
+            self._played_ns = passed_ns + last_ns - first_ns + round(LEAD_S * 1e9)
             self._ends_ns = self._starts_ns + last_ns - first_ns
 
     def over(self) -> bool:
@@ -147,7 +158,7 @@ class Player:
         depth_topic = f"/{name}/depth"
         depths = {int(t): k for k, t in enumerate(toss.file.topic_index(depth_topic).log_time_ns)} if rgbd else {}
         first = frames[0].index if len(frames) else 0
-        shift = max(base - first, 0)
+        shift = base - first if name in self._next_number else 0
         cues = []
         for k, at_ns in enumerate(log_ns.tolist()):
             partner = depths.pop(at_ns, None)
@@ -161,12 +172,12 @@ class Player:
     def _capture(self, toss: Toss, name: str, color: int | None, depth: int | None, shift: int, now: int) -> Any:
         if f"/{name}/color" not in toss.file.channels:
             assert color is not None
-            return _image("image", toss.mono(name)[color], shift, now)
-        picture = None if color is None else _image("color", toss.color(name)[color], shift, now)
+            return _image("image", toss.mono(name)[color], shift, self.later_ns, now)
+        picture = None if color is None else _image("color", toss.color(name)[color], shift, self.later_ns, now)
         if depth is None:
             return RgbdCapture(picture, None, 0.001, self.aligned(name))
         raw = toss.depth(name)[depth]
-        return RgbdCapture(picture, _depth(raw, shift, now), raw.unit_m, self.aligned(name))
+        return RgbdCapture(picture, _depth(raw, shift, self.later_ns, now), raw.unit_m, self.aligned(name))
 
     def aligned(self, name: str) -> bool:
         return f"{name}_depth" not in self.session.calibration.cameras
@@ -179,32 +190,35 @@ class Player:
         batches = np.split(np.arange(len(times)), cuts)
         states, widths = [], []
         for rows in batches:
-            states.append(_Cue(int(times[rows[-1]]), partial(_samples, arm, rows, base)))
+            states.append(_Cue(int(times[rows[-1]]), partial(self._samples, arm, rows, base)))
         for k in np.flatnonzero(np.isfinite(arm.finger_width_m))[::WIDTH_EVERY].tolist():
-            widths.append(_Cue(int(times[k]), partial(_width, arm, k, base)))
+            widths.append(_Cue(int(times[k]), partial(self._width, arm, k, base)))
         self._next_number["arm"] = base + len(times)
         return _Track(states), _Track(widths)
 
+    def _samples(self, arm: ArmStates, rows: Int64[Array, " n"], base: int, now: int) -> ArmSamples:
+        return _samples(arm, rows, base, self.later_ns, now)
 
-def _image(stream: str, frame: EncodedImage, shift: int, now: int) -> Image:
-    return Image(stream, frame.index + shift, Stamp(CLOCK, frame.time_ns), now, decode_image(frame))
-
-
-def _depth(frame: DepthImage, shift: int, now: int) -> Image:
-    return Image("depth", frame.index + shift, Stamp(CLOCK, frame.time_ns), now, frame.raw)
-
-
-def _width(arm: ArmStates, k: int, base: int, now: int) -> GripperSample:
-    return GripperSample(base + k, CLOCK, int(arm.time_ns[k]), now, float(arm.finger_width_m[k]), 0.08, False)
+    def _width(self, arm: ArmStates, k: int, base: int, now: int) -> GripperSample:
+        time_ns = int(arm.time_ns[k]) + self.later_ns
+        return GripperSample(base + k, CLOCK, time_ns, now, float(arm.finger_width_m[k]), 0.08, False)
 
 
-def _samples(arm: ArmStates, rows: Int64[Array, " n"], base: int, now: int) -> ArmSamples:
+def _image(stream: str, frame: EncodedImage, shift: int, later_ns: int, now: int) -> Image:
+    return Image(stream, frame.index + shift, Stamp(CLOCK, frame.time_ns + later_ns), now, decode_image(frame))
+
+
+def _depth(frame: DepthImage, shift: int, later_ns: int, now: int) -> Image:
+    return Image("depth", frame.index + shift, Stamp(CLOCK, frame.time_ns + later_ns), now, frame.raw)
+
+
+def _samples(arm: ArmStates, rows: Int64[Array, " n"], base: int, later_ns: int, now: int) -> ArmSamples:
     q, dq = arm.q_rad[rows], arm.dq_rad_s[rows]
     received = now - (arm.time_ns[rows[-1]] - arm.time_ns[rows])
     none = np.full_like(q, np.nan)
     numbers, ones = base + rows.astype(np.int64), np.ones(len(rows))
     modes: tuple[ArmMode, ...] = tuple(IDLE for _ in rows)
-    return ArmSamples(CLOCK, numbers, arm.time_ns[rows], received, q, dq, none, none, none, ones, modes)
+    return ArmSamples(CLOCK, numbers, arm.time_ns[rows] + later_ns, received, q, dq, none, none, none, ones, modes)
 
 
 class _Replayed(OpenedByContext):

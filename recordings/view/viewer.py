@@ -101,6 +101,11 @@ class Viewer:
             self._log.close()
         self._process = self._log = self._client = None
 
+    @property
+    def closed(self) -> bool:
+        """Whether the window was closed, or the viewer ended by itself."""
+        return self._process is None or self._process.poll() is not None
+
     def wait_until_closed(self) -> None:
         """Return when the user closes the window."""
         if self._process is not None:

@@ -170,6 +170,35 @@ def register_tosses(
     return Registered(tuple(tracks), tuple(map(bool, joined)), fit, first_from_own, gap, tuple(map(bool, unsure)))
 
 
+@dataclass(frozen=True, eq=False)
+class Placement:
+    """Where a toss lies among others: `shared_from_own` 4x4, its `fit` and the `gap` to the next different placement,
+    as in Registered; `joined` and `ambiguous` likewise."""
+
+    shared_from_own: Float[Array, "4 4"]
+    fit: float
+    gap: float
+    joined: bool
+    ambiguous: bool
+
+
+def place_among(
+    toss: TossTrack, others: Sequence[TossTrack], config: RegisterConfig | None = None,
+    matcher: FeatureMatcher | None = None,
+) -> Placement:  # fmt: skip
+    """Where one toss lies in the object frame that the tracks of `others` share already; nothing is refined."""
+    config, tosses = config or RegisterConfig(), [*others, toss]
+    views = int(np.clip(config.many // len(tosses), config.keyframes, config.most_keyframes))
+    keyframes = keyframes_of(tosses, None, [views] * len(tosses), config.shape, config.ground)
+    last = len(others)
+    fit = np.where(np.arange(len(tosses)) == last, np.nan, 0.0)
+    moves = np.tile(np.eye(4), (len(tosses), 1, 1))
+    placing = _Placing(keyframes, Rims.of(keyframes.store), matcher or Sift(), config, moves, fit)
+    gap = float(_placed(placing, [last], lambda t: _many_views(tosses, None, t, config), Silent())[last])
+    joined = bool(np.isfinite(fit[last]))
+    return Placement(moves[last], float(fit[last]), gap, joined, joined and gap < config.ambiguous)
+
+
 def _many_views(
     tosses: Sequence[TossTrack], model: ObjectShape | None, toss: int, config: RegisterConfig
 ) -> KeyframeDatabase:
