@@ -38,8 +38,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--scope", choices=("one", "all"), help="only this scope of the results")
     parser.add_argument(
-        "--live", action="store_true", help="what is known of a session while it is recorded, until the window "
-        "is closed"
+        "--live",
+        action="store_true",
+        help="what is known of a session while it is recorded, until the window is closed",
     )
     parser.set_defaults(work=_work)
     return run_command(parser, argv)
