@@ -10,8 +10,8 @@ from typing import Any
 
 from calibration.report import Report
 from recordings.geometry import CameraModel, Transform
-from recordings.manifest import renew
 from recordings.session import Session
+from recordings.session_writer import renew_manifest
 from recordings.tracks import RigCalibration
 from recordings.whole_file import write_json
 
@@ -47,7 +47,7 @@ def write_entry(session: Session, calibration: RigCalibration, kind: str, entry:
     path = session.path / "calibration.json"
     residuals = {**calibration.residuals, kind: dict(entry)}
     write_json(path, replace(calibration, residuals=residuals).to_json())
-    renew(session.path, path.name)
+    renew_manifest(session.path, path.name)
     return path
 
 

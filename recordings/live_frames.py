@@ -1,8 +1,7 @@
 """The newest colour and depth image, from one process to others on the same machine, through shared memory.
 
 The writer never waits and never knows who reads; a reader takes the newest frame, or notices that it was overwritten
-and
-takes the next. A file of SLOTS equal slots after a head of 64 bytes: magic, slot size, the number of the newest frame.
+and takes the next. A file of SLOTS equal slots after a head of 64 bytes: magic, slot size, the newest frame's number.
 """
 
 from __future__ import annotations

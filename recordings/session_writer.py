@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from recordings.bounded.documents import FORMAT_VERSION
+from recordings.bounded.documents import FORMAT_VERSION, as_dict, read_document
 from recordings.errors import BadInput, WriteFailed
 from recordings.mcap.toss_writer import TossWriter
 from recordings.records import StampedPose
@@ -168,6 +168,23 @@ def write_truth(
         sha256["mesh.obj"] = file_sha256(folder / "mesh.obj")
     write_json(folder / "truth.json", {"format_version": FORMAT_VERSION, **info, "sha256": sha256})
     return folder
+
+
+def renew_manifest(folder: Path, *names: str) -> None:
+    """Sign the named files of a session anew, which a later command has every right to change (calibration.json after
+    `toss-calibrate`). Raises BadInput.
+
+    Nothing happens to a session that has no stop document yet: it is signed when it stops.
+    """
+    document = read_document(folder / "session.json")
+    stop = as_dict(document.get("stop"))
+    if not stop:
+        return
+    missing = [name for name in names if not (folder / name).is_file()]
+    if missing:
+        raise BadInput(f"{folder} has no {', '.join(missing)}; nothing was signed")
+    signed = {**as_dict(stop.get("sha256")), **{name: file_sha256(folder / name) for name in names}}
+    write_json(folder / "session.json", {**document, "stop": {**stop, "sha256": signed}})
 
 
 def _make_folder(folder: Path) -> None:

@@ -14,10 +14,9 @@ from mcap.writer import Writer as PlainWriter
 from recordings.cli_session import main
 from recordings.errors import BadInput
 from recordings.geometry import CameraModel
-from recordings.manifest import renew
 from recordings.records import StampedPose
 from recordings.session import Session
-from recordings.session_writer import SessionWriter, write_truth
+from recordings.session_writer import SessionWriter, renew_manifest, write_truth
 from recordings.tracks import RigCalibration
 from recordings.verify.verify import Report, verify
 
@@ -380,7 +379,7 @@ def test_a_calibration_that_a_command_renewed_is_signed_anew(write_session):
     folder = write_session()
     path = folder / "calibration.json"
     path.write_text(path.read_text().replace("tag36h11", "tag25h9"))
-    renew(folder, "calibration.json")
+    renew_manifest(folder, "calibration.json")
     assert verify(folder).findings == ()
     with pytest.raises(BadInput, match=r"has no truth\.json; nothing was signed"):
-        renew(folder, "truth.json")
+        renew_manifest(folder, "truth.json")
