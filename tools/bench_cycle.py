@@ -6,7 +6,7 @@ python tools/bench_cycle.py --jobs 1,2 SESSION...   # `ours` with one and with t
 python tools/bench_cycle.py --read RESULTS...       # what is there already: how much faster it could have been
 
 CPU time, not wall time, except with --jobs, which wants a machine that has nothing else to do. What stages could reach
-side by side is told from the seconds and inputs that they left: `lanes` plays them through. Peak memory is that of the
+side by side is told from the seconds and inputs that they left: `slots` plays them through. Peak memory is that of the
 largest process.
 """
 
@@ -147,12 +147,12 @@ def stages(out: Path) -> None:
     whole = sum(spent.values())
     print("   CPU-s " + ", ".join(f"{k} {v:.0f}" for k, v in spent.items()) + f"; all {whole:.0f}")
     for count in (2, 4, len(documents)):
-        name = f"{count} lanes" if count < len(documents) else "any number"
-        print(f"   on {name}: {(took := lanes(documents, count)):.0f} s, {whole / took:.2f} times as fast as on one")
+        name = f"{count} slots" if count < len(documents) else "any number"
+        print(f"   on {name}: {(took := slots(documents, count)):.0f} s, {whole / took:.2f} times as fast as on one")
 
 
-def lanes(documents: Sequence[Mapping[str, Any]], count: int) -> float:
-    """Seconds that the stages take on so many lanes, each begun when all that it reads is there, first come first
+def slots(documents: Sequence[Mapping[str, Any]], count: int) -> float:
+    """Seconds that the stages take on so many slots, each begun when all that it reads is there, first come first
     served. What the pipeline decides between stages is taken to need the stages that it compares."""
     keys = {d["key"] for d in documents}
     waits = {d["key"]: {k for k in d["inputs"].values() if k in keys} for d in documents}
@@ -163,9 +163,9 @@ def lanes(documents: Sequence[Mapping[str, Any]], count: int) -> float:
         ready = {
             k: max((ended[x] for x in needed), default=0.0) for k, needed in waits.items() if needed <= ended.keys()
         }
-        lane = min(range(count), key=lambda i: free[i])
-        key = min(ready, key=lambda k: (max(ready[k], free[lane]), ready[k], -cost[k]))
-        free[lane] = ended[key] = max(ready[key], free[lane]) + cost[key]
+        slot = min(range(count), key=lambda i: free[i])
+        key = min(ready, key=lambda k: (max(ready[k], free[slot]), ready[k], -cost[k]))
+        free[slot] = ended[key] = max(ready[key], free[slot]) + cost[key]
         del waits[key]
     return max(ended.values())
 

@@ -1,9 +1,9 @@
 """The engine: calls of stages that do not need each other, side by side.
 
 What asks for stages (the pipeline, a row of the table, one of several sessions) runs here, in threads that cost nothing
-while they wait; what computes them runs in lanes, each of which does one stage at a time: a process on this machine
+while they wait; what computes them runs in slots, each of which does one stage at a time: a process on this machine
 (`workers.py`) or a job on a cluster (`slurm.py`). However the asking is nested, no more stages are computed at once
-than there are lanes. A stage is whole when its own stage.json is there, wherever it was computed.
+than there are slots. A stage is whole when its own stage.json is there, wherever it was computed.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class Task:
 
 
 @runtime_checkable
-class Lane(Protocol):
+class Slot(Protocol):
     """Computes one stage at a time."""
 
     def perform(self, task: Task) -> Outcome:
@@ -96,10 +96,10 @@ class _Asked:
 
 
 class SideBySide:
-    """An engine with lanes. Used as a context: what still runs at its end (Ctrl-C) is stopped and cleared away."""
+    """An engine with slots. Used as a context: what still runs at its end (Ctrl-C) is stopped and cleared away."""
 
-    def __init__(self, lanes: Sequence[Lane], board: Board) -> None:
-        self._lanes, self._board = lanes, board
+    def __init__(self, slots: Sequence[Slot], board: Board) -> None:
+        self._lanes, self._board = slots, board
         self._threads: list[threading.Thread] = []
         self._waiting: deque[_Asked] = deque()
         self._asked: dict[str, _Asked] = {}
@@ -116,8 +116,8 @@ class SideBySide:
             for asked in self._waiting:
                 asked.done.set_exception(Stopped())
             self._changed.notify_all()
-        for lane in self._lanes:
-            lane.stop()
+        for slot in self._lanes:
+            slot.stop()
         for thread in self._threads:
             thread.join(ENDS_WITHIN_S)
 
@@ -153,18 +153,18 @@ class SideBySide:
         asked.done.result()
 
     def _begin(self) -> None:
-        """As many threads as there is work for, each with a lane of its own."""
+        """As many threads as there is work for, each with a slot of its own."""
         if len(self._threads) < min(len(self._lanes), len(self._asked)):
-            lane = self._lanes[len(self._threads)]
-            self._threads.append(threading.Thread(target=self._serve, args=(lane,), daemon=True))
+            slot = self._lanes[len(self._threads)]
+            self._threads.append(threading.Thread(target=self._serve, args=(slot,), daemon=True))
             self._threads[-1].start()
 
-    def _serve(self, lane: Lane) -> None:
+    def _serve(self, slot: Slot) -> None:
         while (asked := self._next()) is not None:
             try:
                 if asked.group is not None and asked.group.stopped():
                     raise Stopped
-                raise_if_told(self._performed(lane, asked.task))
+                raise_if_told(self._performed(slot, asked.task))
             except BaseException as wrong:
                 self._ended(asked)
                 asked.done.set_exception(wrong)
@@ -172,9 +172,9 @@ class SideBySide:
                 self._ended(asked)
                 asked.done.set_result(None)
 
-    def _performed(self, lane: Lane, task: Task) -> Outcome:
+    def _performed(self, slot: Slot, task: Task) -> Outcome:
         try:
-            return lane.perform(task)
+            return slot.perform(task)
         except Lost as gone:
             task.clear()
             raise (Stopped() if self._closed else gone) from None

@@ -1,4 +1,4 @@
-"""Lanes on a Slurm cluster (submitit): each stage is a job.
+"""Slots on a Slurm cluster (submitit): each stage is a job.
 
 A job is done when its own marker, a file written last and renamed, is there; one that has left Slurm's queue without it
 ended without a result. The queue itself is asked (`squeue`), so that a cluster needs no accounting. A job whose node

@@ -1,4 +1,4 @@
-"""Lanes on this machine: processes that compute the stages they are sent, one at a time.
+"""Slots on this machine: processes that compute the stages they are sent, one at a time.
 
 A worker is begun when there is work for it. It takes no notice of Ctrl-C, which its parent hears; it ends when it is
 stopped, and by itself when its parent is gone, however that ended.
@@ -148,7 +148,7 @@ class _Told:
 
 
 class Shown:
-    """`run.progress` where stages are computed in lanes: sent to the board by the process that computes one."""
+    """`run.progress` where stages are computed in slots: sent to the board by the process that computes one."""
 
     def __call__(self, label: str) -> Progress:
         return Silent() if _to_parent is None else _Told(label)

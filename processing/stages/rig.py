@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from processing.run import CAMERA, Run
-from processing.segment.background.depth_delay import Sightings, believed, delay_of, sightings
+from processing.segment.background.depth_delay import OutlineShifts, delay_of, outline_shifts, significant_delay
 from processing.segment.background.depth_scale import TableScale, accepted_scale, table_scale
 from processing.segment.background.static_scene import StaticScene
 from processing.segment.robot.fit import RobotFit, RobotObservation, choose_observations, fit_robot
@@ -152,11 +152,11 @@ def with_depth_in_time(run: Run, scene: Done, masks: Mapping[int, Done]) -> Run:
         learned, seen, stamps_s = StaticScene.read(scene.folder), [], []
         for t, done in masks.items():
             frames = run.session.toss(t).rgbd(CAMERA)
-            seen.append(sightings(frames, read_masks(done.folder, t), learned, settings))
+            seen.append(outline_shifts(frames, read_masks(done.folder, t), learned, settings))
             stamps_s.append((frames.depth_times_ns - frames.times_ns) * 1e-9)
         stamped_s = float(np.median(np.concatenate(stamps_s)))
-        found = delay_of(Sightings.joined(seen), settings)
-        added_s = believed(found, stamped_s, settings)
+        found = delay_of(OutlineShifts.joined(seen), settings)
+        added_s = significant_delay(found, stamped_s, settings)
         if found is None:
             return DepthDelayResult(stamped_s, None, None, added_s, 0)
         return DepthDelayResult(stamped_s, found.delay_s, found.sigma_s, added_s, found.frames)

@@ -231,7 +231,7 @@ def test_frames_between_tosses_are_kept_on_request(record: Callable[..., Any]) -
 def test_a_take_that_does_not_end_says_why_while_it_runs_and_in_its_verdict(
     record: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("acquisition.run.WAITS_AFTER_S", 0.5)
+    monkeypatch.setattr("acquisition.take.WAITS_AFTER_S", 0.5)
     done = record(seconds=None, longest_toss_s=3.0)
     said = [text for text in done.operator.told if text.startswith("still recording after")]
     assert said

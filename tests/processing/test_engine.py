@@ -1,4 +1,4 @@
-"""Stages side by side: as many as there are lanes, each once, the same bytes as in turn; nothing half is left."""
+"""Stages side by side: as many as there are slots, each once, the same bytes as in turn; nothing half is left."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ cloudpickle.register_pickle_by_value(sys.modules[__name__])  # a worker cannot i
 
 
 class Here:
-    """A lane in this process, which counts how many are at work."""
+    """A slot in this process, which counts how many are at work."""
 
     at_work = 0
     most = 0
@@ -54,7 +54,7 @@ class Here:
 
 @pytest.fixture
 def three() -> Iterator[SideBySide]:
-    """An engine of three lanes in this process."""
+    """An engine of three slots in this process."""
     Here.at_work = Here.most = 0
     with SideBySide([Here() for _ in range(3)], Board()) as engine:
         yield engine

@@ -64,7 +64,7 @@ class DepthDelaySettings:
 
 
 @dataclass(frozen=True, eq=False)
-class Sightings:
+class OutlineShifts:
     """What the frames of one toss tell: how far (x, y; pixels) colour shows the object from where depth does, and how
     fast it moves (pixels a second)."""
 
@@ -72,8 +72,8 @@ class Sightings:
     speed_px_s: Float[Array, "n 2"]
 
     @staticmethod
-    def joined(parts: Sequence[Sightings]) -> Sightings:
-        return Sightings(*(np.concatenate([getattr(p, k) for p in parts]) for k in ("way_px", "speed_px_s")))
+    def joined(parts: Sequence[OutlineShifts]) -> OutlineShifts:
+        return OutlineShifts(*(np.concatenate([getattr(p, k) for p in parts]) for k in ("way_px", "speed_px_s")))
 
 
 @dataclass(frozen=True)
@@ -85,9 +85,9 @@ class DepthDelay:
     frames: int
 
 
-def sightings(
+def outline_shifts(
     frames: RgbdFrames, masks: Sequence[Bool[Array, "h w"]], scene: StaticScene, s: DepthDelaySettings
-) -> Sightings:
+) -> OutlineShifts:
     """Of the frames of one toss in which the object moves steadily or not at all; `masks`: where it is, roughly."""
     speeds = _steady_speeds(frames.times_ns, masks, s)
     ways, told = [], []
@@ -96,7 +96,7 @@ def sightings(
         if way is not None:
             ways.append(way)
             told.append(speeds[i])
-    return Sightings(np.array(ways).reshape(-1, 2), np.array(told).reshape(-1, 2))
+    return OutlineShifts(np.array(ways).reshape(-1, 2), np.array(told).reshape(-1, 2))
 
 
 def _steady_speeds(
@@ -120,9 +120,9 @@ def _chosen(speed_px_s: Float[Array, " n"], s: DepthDelaySettings) -> list[int]:
     return [int(i) for i in np.unique(np.concatenate([order[: s.slow_frames], order[-s.fast_frames :]]))]
 
 
-def delay_of(seen: Sightings, s: DepthDelaySettings) -> DepthDelay | None:
-    """The delay that all sightings together tell; None where too few move. One that may be chance is told as it is: see
-    `believed`."""
+def delay_of(seen: OutlineShifts, s: DepthDelaySettings) -> DepthDelay | None:
+    """The delay that all frames together tell; None where too few move. One that may be chance is told as it is: see
+    `significant_delay`."""
     moving = int((np.linalg.norm(seen.speed_px_s, axis=1) > s.moving_px_s).sum())
     if moving < s.least_frames:
         return None
@@ -141,7 +141,7 @@ def delay_of(seen: Sightings, s: DepthDelaySettings) -> DepthDelay | None:
     return DepthDelay(float(fit[2]), float(sigma * np.sqrt(np.linalg.pinv(information)[2, 2])), moving)
 
 
-def believed(found: DepthDelay | None, stamped_s: float, s: DepthDelaySettings) -> float:
+def significant_delay(found: DepthDelay | None, stamped_s: float, s: DepthDelaySettings) -> float:
     """What (seconds) is added to depth's stamps, which have it exposed `stamped_s` after colour: nothing where they
     differ from the images by little, by chance, or by more than can be."""
     if found is None or abs(found.delay_s) > s.longest_s:

@@ -16,10 +16,10 @@ from processing.run import Run
 from processing.segment.background.depth_delay import (
     DepthDelay,
     DepthDelaySettings,
-    Sightings,
-    believed,
+    OutlineShifts,
     delay_of,
-    sightings,
+    outline_shifts,
+    significant_delay,
 )
 from processing.segment.background.static_scene import StaticScene
 from processing.sensor.depth_stamps import with_depth_later
@@ -60,7 +60,7 @@ def told(tiny_world: Any, scene: StaticScene, delay_s: float) -> DepthDelay | No
     frames = late(tiny_world, [f for f, _ in seen], delay_s)
     times_ns = np.array([f.time_ns for f in frames], dtype=np.int64)
     stream = RgbdFrames(times_ns, lambda i: frames[i], times_ns, (), 0)
-    return delay_of(sightings(stream, [m for _, m in seen], scene, SETTINGS), SETTINGS)
+    return delay_of(outline_shifts(stream, [m for _, m in seen], scene, SETTINGS), SETTINGS)
 
 
 @pytest.mark.parametrize("delay_s", [-0.008, 0.0, 0.004, 0.016])
@@ -76,34 +76,34 @@ def test_the_delay_of_depth_is_told_to_two_milliseconds_by_one_toss_of_a_tiny_ca
 def test_an_offset_that_is_there_at_rest_is_no_delay() -> None:
     speed = np.concatenate([np.zeros((6, 2)), np.linspace([100, 0], [400, 300], 12)])
     noise = 0.1 * np.random.default_rng(0).standard_normal(speed.shape)
-    found = delay_of(Sightings(np.array([1.5, -0.7]) - 0.012 * speed + noise, speed), SETTINGS)
+    found = delay_of(OutlineShifts(np.array([1.5, -0.7]) - 0.012 * speed + noise, speed), SETTINGS)
     assert found is not None
     assert found.delay_s == pytest.approx(0.012, abs=3 * found.sigma_s)
-    still = delay_of(Sightings(np.array([1.5, -0.7]) + noise, speed), SETTINGS)
-    assert believed(still, 0.0, SETTINGS) == 0.0
+    still = delay_of(OutlineShifts(np.array([1.5, -0.7]) + noise, speed), SETTINGS)
+    assert significant_delay(still, 0.0, SETTINGS) == 0.0
 
 
 def test_frames_in_which_colour_was_mistaken_do_not_pull() -> None:
     speed = np.linspace([100, 0], [400, 300], 20)
     way = -0.01 * speed + 0.1 * np.random.default_rng(1).standard_normal(speed.shape)
     way[[0, 5, 11, 17]] += 15.0
-    found = delay_of(Sightings(way, speed), SETTINGS)
+    found = delay_of(OutlineShifts(way, speed), SETTINGS)
     assert found is not None
     assert found.delay_s == pytest.approx(0.01, abs=1e-3)
 
 
 def test_what_hardly_moves_tells_nothing() -> None:
     speed = np.full((30, 2), 20.0)
-    assert delay_of(Sightings(-0.01 * speed, speed), SETTINGS) is None
-    assert believed(None, 0.0, SETTINGS) == 0.0
+    assert delay_of(OutlineShifts(-0.01 * speed, speed), SETTINGS) is None
+    assert significant_delay(None, 0.0, SETTINGS) == 0.0
 
 
 def test_only_a_delay_beyond_chance_and_beyond_what_the_stamps_say_is_believed() -> None:
-    assert believed(DepthDelay(0.012, 0.0005, 20), 0.0, SETTINGS) == pytest.approx(0.012)
-    assert believed(DepthDelay(0.012, 0.0005, 20), 0.009, SETTINGS) == pytest.approx(0.003)
-    assert believed(DepthDelay(0.012, 0.0005, 20), 0.0115, SETTINGS) == 0.0
-    assert believed(DepthDelay(0.012, 0.005, 20), 0.0, SETTINGS) == 0.0
-    assert believed(DepthDelay(0.05, 0.0005, 20), 0.0, SETTINGS) == 0.0
+    assert significant_delay(DepthDelay(0.012, 0.0005, 20), 0.0, SETTINGS) == pytest.approx(0.012)
+    assert significant_delay(DepthDelay(0.012, 0.0005, 20), 0.009, SETTINGS) == pytest.approx(0.003)
+    assert significant_delay(DepthDelay(0.012, 0.0005, 20), 0.0115, SETTINGS) == 0.0
+    assert significant_delay(DepthDelay(0.012, 0.005, 20), 0.0, SETTINGS) == 0.0
+    assert significant_delay(DepthDelay(0.05, 0.0005, 20), 0.0, SETTINGS) == 0.0
 
 
 def put_right(session: Path, out: Path) -> tuple[Run, Run]:
