@@ -1,4 +1,3 @@
-# long because: what is seen, how it flies and what follows from it are one story
 """A toss, watched while it happens: release, first impact, rest, from the gripper's width and thumbnails of depth.
 
 Everything above the table that is not the arm is the object. In flight its middle follows a parabola; where it leaves

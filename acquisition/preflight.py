@@ -1,4 +1,3 @@
-# long because: one check after the other, each a few lines
 """Before the first toss: is everything there, at its rate, sharp, steadily lit, calibrated, with room on the disk?"""
 
 from __future__ import annotations

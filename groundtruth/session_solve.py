@@ -55,8 +55,6 @@ class SolveConfig:
     corner_floor_px: float = 0.08
     """Standard deviation that a corner has at least: lens and printing are not perfect."""
     huber_px: float = 3.0
-    flat_deg: float = 12.0
-    """Tags seen flatter than this start nothing; their corners count."""
     flight: FlightConfig = field(default_factory=FlightConfig)
 
 

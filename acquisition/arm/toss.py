@@ -1,4 +1,3 @@
-# long because: a target, its trajectory and every check of it belong on one page
 """A toss: from the release that is wanted to a trajectory that the arm can do, proven before anything moves.
 
 The tool reaches the release at constant joint speeds, held for as long as the gripper's delay is uncertain, so that

@@ -1,4 +1,3 @@
-# long because: four replayed devices share one player
 """A recorded session played back as devices, at its own pace or as fast as it is read.
 
     setup = replay_setup(Path("sessions/first"))            # what `--rig replay:SESSION` opens

@@ -28,7 +28,6 @@ POSE = 6
 STEPS = 100
 """Where views hardly tell focal length from distance, forty steps stop 1 % short of the least residual."""
 SMALL_GAIN = 1e-6
-STEP_PX = 1e-4
 BEHIND_PX = 1e4
 """Residual of a point that came to lie behind its camera."""
 

@@ -27,7 +27,6 @@ from recordings.geometry import CameraModel
 
 Candidates = list[Float[Array, "4 4"]]
 LEAST_LOOKS = 3
-FITS_PX = 3.0
 WRONG_TAG_PX = 4.0
 """Sightings that fit no better than this are left out and counted."""
 

@@ -12,8 +12,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import torch
-from jaxtyping import Float
-from numpy import ndarray as Array
 from torch import Tensor
 
 from processing.field.encoding import EncodingName
@@ -56,13 +54,11 @@ class FieldConfig:
 
 @dataclass(frozen=True, eq=False)
 class TrainedField:
-    """The field, its warm start, the refined views with the information matrices (n, 6, 6) of their poses, and the
-    loss of every tenth step."""
+    """The field, its warm start, the refined views, and the loss of every tenth step."""
 
     field: ObjectField
     grid: Grid
     views: tuple[FieldView, ...]
-    pose_information: Float[Array, "n 6 6"]
     losses: tuple[float, ...]
 
 
@@ -82,31 +78,30 @@ def train_field(
     progress = progress or Silent()
     torch.manual_seed(config.seed)
     dataset = make_ray_dataset(views).to(device)
-    information = np.zeros((len(views), 6, 6))
     total = config.pose_rounds + config.steps
     for done in range(config.pose_rounds):
         start = ObjectField(fuse(views, config.fuse), config.encoding).to(device)
-        views, information = refined_views(start, views, dataset, config.poses)
+        views = refined_views(start, views, dataset, config.poses)
         progress.step(done + 1, total, "field: poses")
     grid = fuse(views, config.fuse, prior_shape)
     model = ObjectField(grid, config.encoding).to(device)
     losses = _optimise(model, stack_poses(views, device), dataset, config, progress)
-    return TrainedField(model, grid, tuple(views), information, losses)
+    return TrainedField(model, grid, tuple(views), losses)
 
 
 def refined_views(
     model: ObjectField, views: Sequence[FieldView], dataset: RayDataset, config: PoseConfig
-) -> tuple[list[FieldView], Float[Array, "n 6 6"]]:
+) -> list[FieldView]:
     """The views with both their poses moved by the correction that the field asks for."""
     rotation, translation = stack_poses(views, str(dataset.depth.device))
-    rotation, translation, information = refine_poses(model, rotation, translation, dataset, config)
+    rotation, translation, _ = refine_poses(model, rotation, translation, dataset, config)
     out = []
     for view, R, t in zip(views, rotation.double().cpu().numpy(), translation.double().cpu().numpy(), strict=True):
         at_depth = np.eye(4)
         at_depth[:3, :3], at_depth[:3, 3] = nearest_rotation(R), t
         old_from_new = np.linalg.inv(view.camera_from_object_at_depth) @ at_depth
         out.append(view.posed(view.camera_from_object @ old_from_new, at_depth))
-    return out, information.double().cpu().numpy()
+    return out
 
 
 def _optimise(
