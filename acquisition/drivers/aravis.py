@@ -58,6 +58,7 @@ _FUNCTIONS: dict[str, tuple[Any, tuple[Any, ...]]] = {
     "arv_camera_get_model_name": (c_char_p, (c_void_p, _ERROR)),
     "arv_camera_get_device_serial_number": (c_char_p, (c_void_p, _ERROR)),
     "arv_camera_is_gv_device": (c_bool, (c_void_p,)),
+    "arv_gv_device_is_controller": (c_bool, (c_void_p,)),
     "arv_camera_gv_set_packet_size": (None, (c_void_p, c_int, _ERROR)),
     "arv_camera_gv_auto_packet_size": (c_uint, (c_void_p, _ERROR)),
     "arv_camera_is_feature_available": (c_bool, (c_void_p, c_char_p, _ERROR)),
@@ -167,6 +168,12 @@ class Aravis:
         keys = ("id", "vendor", "model", "serial_nbr", "address", "protocol")
         count = self.call("arv_get_n_devices")
         return [Found(*(self.call(f"arv_get_device_{key}", i) or "" for key in keys)) for i in range(count)]
+
+    def controls(self, camera: int) -> bool:
+        """Whether the camera obeys this process: a GigE camera obeys the first that opens it, as long as that lives."""
+        if not self.call("arv_camera_is_gv_device", camera):
+            return True
+        return bool(self.call("arv_gv_device_is_controller", self.call("arv_camera_get_device", camera)))
 
     def on_lost(self, camera: int, act: Callable[[], None]) -> Any:
         """Call `act` (from a thread of libaravis) when the camera stops answering. Keep what this returns."""

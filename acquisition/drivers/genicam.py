@@ -30,6 +30,9 @@ from recordings.errors import DeviceNotFound
 
 POP_US = 100_000
 LEAVE_S = 0.8
+HEARTBEAT_S = 5.0
+"""After so long without a word a GigE camera lets another program control it (the standard's own value is 3 s)."""
+LOOK_S = 0.2
 FRAME_ID_BITS = 16
 """GigE Vision 1 counts frames from 1 to 65535 and starts over at 1."""
 
@@ -64,17 +67,13 @@ class GenicamCamera(OpenedByContext):
         self.close()
         self._aravis = Aravis.get()
         self._found = self._choose(self._aravis.found())
-        try:
-            self._camera = self._aravis.call("arv_camera_new", self._found.id)
-        except AravisError as error:
-            raise DeviceNotFound(
-                f"{self.name}: {self._found} does not open: {error}; does another program hold it?"
-            ) from error
+        self._camera = self._take_control(self._aravis, self._found)
         self._inbox = Inbox(self._settings.buffers)
         self._warnings = []
         inbox, what = self._inbox, f"{self.name}: {self._found}"
         self._keep = self._aravis.on_lost(self._camera, lambda: inbox.lose(f"{what} no longer answers; replug, reopen"))
         try:
+            self._aravis.call("arv_camera_stop_acquisition", self._camera)  # what a program that died had started
             self._granted = apply(self._aravis, self._camera, self._settings, self._warnings)
         except AravisError as error:
             self.close()
@@ -82,6 +81,21 @@ class GenicamCamera(OpenedByContext):
         except DeviceRefused:
             self.close()
             raise
+
+    def _take_control(self, aravis: Aravis, found: Found) -> int:
+        """Aravis' camera, obeying us. One whose last program has died obeys nobody until its heartbeat runs out."""
+        until = time.monotonic() + HEARTBEAT_S
+        while True:
+            try:
+                camera: int = aravis.call("arv_camera_new", found.id)
+            except AravisError as error:
+                raise DeviceNotFound(f"{self.name}: {found} does not open: {error}") from error
+            if aravis.controls(camera):
+                return camera
+            aravis.call("g_object_unref", camera)
+            if time.monotonic() > until:
+                raise DeviceRefused(f"{self.name}: {found} is controlled by another program; close that one first")
+            time.sleep(LOOK_S)
 
     def start(self) -> None:
         camera = self._opened()

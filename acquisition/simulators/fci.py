@@ -7,12 +7,14 @@
 The ports are fixed in libfranka (1337, 1338): two arms need two loopback addresses. Simulated are the connection, the
 1 kHz state stream over UDP, joint position and joint velocity motions with the arm's supervision of limits, stopping,
 error recovery, user stop and the count of commands that came in time. Not simulated: Cartesian and torque control,
-dynamics (all torques are 0) and forward kinematics (poses are the identity).
+dynamics (all torques are 0) and forward kinematics (poses are the identity). During a motion a millisecond lasts until
+the client has answered it (PATIENCE_S at most), so that a busy machine stretches time and loses no command.
 """
 
 from __future__ import annotations
 
 import random
+import select
 import socket
 import struct
 import threading
@@ -40,7 +42,9 @@ FAULTS = {
 }
 COMMUNICATION_MISSES = 20
 """Missing commands in a row at which a Panda aborts."""
-FIRST_COMMAND_TICKS = 200
+FIRST_COMMAND_TICKS = 2000
+PATIENCE_S = 0.5
+"""So long a motion's millisecond may last when the client has not answered it: only `faults` lose commands here."""
 RATE_WINDOW = 100
 
 
@@ -179,11 +183,21 @@ class FciServer(Faulty):
                     return
                 with self._lock:
                     ended = self._tick(self._commands(udp), state)
-                if not (self._faults.active("freeze") or self._lost()):
+                sent = not (self._faults.active("freeze") or self._lost())
+                if sent:
                     udp.sendto(state.tobytes(), client)
                 if ended is not None:  # after the state that shows the motion's end, as the arm does
                     ended.answer()
+                if sent:
+                    self._wait_for_answer(udp)
                 self._stretched_s += pacer.wait()
+
+    def _wait_for_answer(self, udp: socket.socket) -> None:
+        """Until a command is there, during a motion whose client has not just let one wait run out."""
+        with self._lock:
+            motion = self._motion
+        if motion.commanded and motion.answering:
+            motion.answering = bool(select.select([udp], [], [], PATIENCE_S)[0])
 
     def _commands(self, udp: socket.socket) -> np.void | None:
         """The newest command since the last tick that was not lost."""
@@ -196,6 +210,7 @@ class FciServer(Faulty):
             if len(data) != wire.ROBOT_COMMAND.itemsize or self._faults.active("no_commands") or self._lost():
                 continue
             self._counts["commands"] += 1
+            self._motion.answering = True
             newest = np.frombuffer(data, wire.ROBOT_COMMAND)[0]
 
     def _lost(self) -> bool:
@@ -303,6 +318,7 @@ class _Motion:
         self.ticks = 0
         self.missing = 0
         self.commanded = False
+        self.answering = True
         self.in_time: deque[bool] = deque(maxlen=RATE_WINDOW)
 
     def answer(self) -> None:

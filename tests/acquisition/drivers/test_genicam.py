@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -63,6 +65,30 @@ def test_a_free_running_camera_keeps_its_rate_by_its_own_stamps(three: list[str]
     assert images[0] is not None
     assert images[0].exposure_s == pytest.approx(0.01)
     assert np.ptp(images[0].pixels) > 100  # the fake's ramp, not zeros
+
+
+HOLDER = """
+import sys, time
+from acquisition.drivers.genicam import GenicamCamera, GenicamSettings
+with GenicamCamera(serial=sys.argv[1], settings=GenicamSettings(rate_hz=50.0, packet_bytes=1400)) as camera:
+    camera.start()
+    print("it streams", flush=True)
+    time.sleep(60)
+"""
+
+
+def test_a_camera_of_another_program_is_refused_and_one_whose_program_died_streams(three: list[str]) -> None:
+    command = [sys.executable, "-c", HOLDER, three[2]]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as other:
+        assert other.stdout is not None
+        assert other.stdout.readline() == "it streams\n"
+        camera = GenicamCamera(serial=three[2], settings=SETTINGS)
+        with pytest.raises(DeviceRefused, match="is controlled by another program; close that one first"):
+            camera.open()
+        other.kill()
+    with camera:
+        camera.start()
+        assert camera.read(5.0) is not None
 
 
 def test_what_the_camera_cannot_do_is_refused(three: list[str]) -> None:
