@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import resource
 from collections.abc import Callable, Generator
@@ -32,6 +33,7 @@ REAL_TIME = (
     "acquisition/test_faults.py",
 )
 """What talks to devices against the clock: one at a time, whatever else runs."""
+TOGETHER = "real time"
 
 
 @pytest.hookimpl(tryfirst=True)
@@ -39,7 +41,21 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """For pytest-xdist's `loadgroup`: a file's tests stay together, for its fixtures; those in real time all do."""
     for item in items:
         file = item.path.relative_to(ROOT / "tests").as_posix()
-        item.add_marker(pytest.mark.xdist_group("real time" if file.startswith(REAL_TIME) else file))
+        item.add_marker(pytest.mark.xdist_group(TOGETHER if file.startswith(REAL_TIME) else file))
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
+    """A test in real time, and what it starts, goes before other processes where this user may (root)."""
+    marker = item.get_closest_marker("xdist_group")
+    if marker is None or marker.args != (TOGETHER,):
+        return (yield)
+    with contextlib.suppress(PermissionError):
+        os.setpriority(os.PRIO_PROCESS, 0, -10)
+    try:
+        return (yield)
+    finally:
+        os.setpriority(os.PRIO_PROCESS, 0, 0)
 
 
 @pytest.hookimpl(wrapper=True)

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 ADD_LIMIT_M = 0.1
 POINTS = 2_000
 SURFACE_POINTS = 30_000
+FEW, LAST_STEPS = 3000, 8
+"""Points that `icp_align` takes its first steps with, and steps that it then takes with all."""
 FLIPPED_DEG = 45.0
 
 
@@ -150,19 +152,24 @@ def chamfer(estimate: trimesh.Trimesh, truth: trimesh.Trimesh, count: int = SURF
 def icp_align(
     source_m: Float[Array, "n 3"], target_m: Float[Array, "m 3"], steps: int = 60, share: float = 0.95
 ) -> Float[Array, "4 4"]:
-    """Rigid motion that lays source points on target points: point to point, the best `share` of the pairs."""
+    """Rigid motion that lays source points on target points: point to point, the best `share` of the pairs.
+
+    The first FEW source points find the way in at most `steps` steps, all of them the place in at most LAST_STEPS; the
+    points' order must be random, as that of `surface_points` is.
+    """
     from scipy.spatial import cKDTree
 
-    tree, moved, total = cKDTree(target_m), source_m.copy(), np.eye(4)
-    for _ in range(steps):
-        distance, nearest = tree.query(moved)
-        use = distance <= np.quantile(distance, share)
-        step = _kabsch(moved[use], target_m[nearest[use]])
-        total = step @ total
-        after = source_m @ total[:3, :3].T + total[:3, 3]
-        if float(np.abs(after - moved).max()) < 1e-7:
-            break
-        moved = after
+    tree, total = cKDTree(target_m), np.eye(4)
+    for points, most in ((source_m[:FEW], steps), (source_m, LAST_STEPS)):
+        moved = points @ total[:3, :3].T + total[:3, 3]
+        for _ in range(most):
+            distance, nearest = tree.query(moved)
+            use = distance <= np.quantile(distance, share)
+            total = _kabsch(moved[use], target_m[nearest[use]]) @ total
+            after = points @ total[:3, :3].T + total[:3, 3]
+            way_m, moved = float(np.abs(after - moved).max()), after
+            if way_m < 1e-7:
+                break
     return total
 
 

@@ -110,7 +110,7 @@ def rms_px(model, views):
     return float(np.sqrt((solve_lens(model, views, range(len(views)), free_lens=False)[0].residual_px ** 2).mean()))
 
 
-@pytest.mark.parametrize("seed", [0, 2])
+@pytest.mark.parametrize("seed", [0, pytest.param(2, marks=pytest.mark.slow)])
 def test_views_never_seen_are_explained_as_well_as_by_plain_opencv(geometry, seed):
     """With corners of which some are wrong by pixels, and a lens that bends by as much as the noise."""
     rng = np.random.default_rng(seed)

@@ -193,6 +193,7 @@ def test_an_interrupted_run_keeps_everything_and_resumes_to_the_same_bytes(
     assert output_bytes(tmp_path / "resumed") == output_bytes(tmp_path / "whole")
 
 
+@pytest.mark.slow  # fast siblings: an interrupted run (below), a killed worker and a killed run (test_engine)
 def test_a_run_killed_in_the_middle_resumes_to_the_same_table(record_tiny: Record, tmp_path: Path) -> None:
     session = record_tiny(frames=10)
     code = "import sys; from processing.cli import main; sys.exit(main(sys.argv[1:]))"
@@ -213,7 +214,7 @@ def test_a_run_killed_in_the_middle_resumes_to_the_same_table(record_tiny: Recor
 def test_two_runs_at_once_on_one_results_folder_both_finish(record_tiny: Record, tmp_path: Path) -> None:
     session, out = record_tiny(tosses=(0,), frames=5), tmp_path / "out"
     code = "import sys; from processing.cli import main; sys.exit(main(sys.argv[1:]))"
-    command = [sys.executable, "-c", code, str(session), "--variant", "bundlesdf-1", "--out", str(out)]
+    command = [sys.executable, "-c", code, str(session), "--variant", "bundlesdf-1", "--jobs", "1", "--out", str(out)]
     runs = [subprocess.Popen(command, stdout=subprocess.DEVNULL) for _ in range(2)]
     assert [run.wait(timeout=300) for run in runs] == [0, 0]
     assert len(list(out.glob("track-*"))) == 1

@@ -26,7 +26,7 @@ def host() -> str:
     return f"127.{20 + os.getpid() % 200}.{os.getpid() // 200 % 250}.{next(_COUNT)}"
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def fci() -> Iterator[tuple[str, ChildProcess]]:
     """A Panda with its gripper: (address, simulator)."""
     pytest.importorskip("panda_py", reason="panda-python is not installed (rig-franka)")
@@ -35,7 +35,7 @@ def fci() -> Iterator[tuple[str, ChildProcess]]:
         yield address, simulator
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def rtde() -> Iterator[tuple[str, ChildProcess]]:
     """A UR5e controller: (address, simulator)."""
     pytest.importorskip("rtde_control", reason="ur-rtde is not installed (rig-ur)")
