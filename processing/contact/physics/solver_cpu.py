@@ -14,9 +14,9 @@ from numba import njit
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def _project(y, out):
+def _project(y, size, out):
     """Nearest points of the Lorentz cones {y_2 >= |y_01|}."""
-    for c in range(len(y) // 3):
+    for c in range(size // 3):
         tx, ty, n = y[3 * c], y[3 * c + 1], y[3 * c + 2]
         length = (tx * tx + ty * ty) ** 0.5
         if length <= n:
@@ -30,11 +30,10 @@ def _project(y, out):
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def _hessian(A, y, epsilon, H):
-    """1 + A' P'(y) A / epsilon, P' as in solver.project_jacobian."""
+def _hessian(A, y, size, epsilon, H, D, DA):
+    """1 + A' P'(y) A / epsilon, P' as in solver.project_jacobian; `D` (3, 3) and `DA` (3, 6) are room to work in."""
     H[:] = 0.0
-    D, DA = np.zeros((3, 3)), np.zeros((3, 6))
-    for c in range(len(y) // 3):
+    for c in range(size // 3):
         tx, ty, n = y[3 * c], y[3 * c + 1], y[3 * c + 2]
         length = (tx * tx + ty * ty) ** 0.5
         if length <= -n and not length <= n:
@@ -88,17 +87,17 @@ def _descend(H, gradient, out):
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def _step(y, Ad, v, d, slope, epsilon, flat_enough, search_steps, near, impulse):
+def _step(y, Ad, size, v, d, slope, epsilon, flat_enough, search_steps, near, impulse):
     """Length of the step along d to where the slope has nearly vanished (Illinois form of regula falsi)."""
     length, low, high, at_low, at_high = 1.0, 0.0, 1.0, slope, 0.0
     for turn in range(search_steps + 1):
         here = 0.0
-        for i in range(len(y)):
+        for i in range(size):
             near[i] = y[i] - length * Ad[i] / epsilon
-        _project(near, impulse)
+        _project(near, size, impulse)
         for i in range(6):
             here += d[i] * (v[i] + length * d[i])
-        for i in range(len(y)):
+        for i in range(size):
             here -= Ad[i] * impulse[i]
         if turn == 0:
             if not here > flat_enough * abs(slope):
@@ -117,13 +116,70 @@ def _step(y, Ad, v, d, slope, epsilon, flat_enough, search_steps, near, impulse)
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def _outward(A, v, q, epsilon, y):
+def _outward(A, v, q, size, epsilon, y):
     """y = -(A v + q) / epsilon."""
-    for i in range(len(q)):
+    for i in range(size):
         total = q[i]
         for j in range(6):
             total += A[i, j] * v[j]
         y[i] = -total / epsilon
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def room(most):
+    """What `solve_row` works in, for up to `most` entries of q."""
+    return np.zeros((3, most)), np.zeros((3, 6)), np.zeros((6, 6)), np.zeros((3, 3)), np.zeros((3, 6))
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def solve_row(A, q, size, epsilon, v, tolerance, most_iterations, flat_enough, search_steps, impulse, work):
+    """One row: the first `size` entries of A (3k, 6) and q (3k,); `v` (6,) holds the start and takes the result,
+    `impulse` (3k,) the impulses, `work` is a `room`.
+
+    Returns whether it was solved, and the iterations.
+    """
+    (y, near, Ad), (gradient, d, momentum), H, D, DA = work
+    iterations = 0
+    while True:
+        _outward(A, v, q, size, epsilon, y)
+        _project(y, size, impulse)
+        if iterations >= most_iterations:
+            return False, iterations
+        iterations += 1
+        size_of_v = size_of_momentum = size_of_gradient = value = 0.0
+        momentum[:] = 0.0
+        for i in range(size):
+            if impulse[i] != 0.0:
+                for j in range(6):
+                    momentum[j] += A[i, j] * impulse[i]
+        for j in range(6):
+            gradient[j] = v[j] - momentum[j]
+            size_of_v += v[j] * v[j]
+            size_of_momentum += momentum[j] * momentum[j]
+            size_of_gradient += gradient[j] * gradient[j]
+        if size_of_gradient**0.5 <= 1e-14 + tolerance * max(size_of_v, size_of_momentum) ** 0.5:
+            return True, iterations
+        for i in range(size):
+            value += impulse[i] * impulse[i]
+        value = 0.5 * size_of_v + 0.5 * epsilon * value
+        _hessian(A, y, size, epsilon, H, D, DA)
+        _descend(H, gradient, d)
+        slope = 0.0
+        for j in range(6):
+            slope += gradient[j] * d[j]
+        if -slope <= 1e-13 * value + 1e-22:  # no further fall within rounding
+            return True, iterations
+        if not np.isfinite(slope):
+            return False, iterations
+        for i in range(size):
+            Ad[i] = 0.0
+            for j in range(6):
+                Ad[i] += A[i, j] * d[j]
+        length = _step(y, Ad, size, v, d, slope, epsilon, flat_enough, search_steps, near, impulse)
+        for j in range(6):
+            v[j] += length * d[j]
 
 
 @njit(cache=True, nogil=True)
@@ -133,51 +189,13 @@ def solve_rows(A, q, epsilon, primal, tolerance, most_iterations, flat_enough, s
 
     Returns impulses (n, 3k), whether each row failed, and the most iterations of any.
     """
-    n, k3 = q.shape
-    impulses, failed = np.zeros((n, k3)), np.ones(n, dtype=np.bool_)
-    y, near, Ad = np.zeros(k3), np.zeros(k3), np.zeros(k3)
-    gradient, d, H = np.zeros(6), np.zeros(6), np.zeros((6, 6))
+    n, size = q.shape
+    impulses, failed, work = np.zeros((n, size)), np.ones(n, dtype=np.bool_), room(size)
     most = 0
-    for row in range(n):
-        v, impulse = primal[row], impulses[row]
-        iterations = 0
-        while True:
-            _outward(A[row], v, q[row], epsilon, y)
-            _project(y, impulse)
-            if iterations >= most_iterations:
-                break
-            iterations += 1
-            size = size_of_momentum = size_of_gradient = value = 0.0
-            for j in range(6):
-                momentum = 0.0
-                for i in range(k3):
-                    momentum += A[row, i, j] * impulse[i]
-                gradient[j] = v[j] - momentum
-                size += v[j] * v[j]
-                size_of_momentum += momentum * momentum
-                size_of_gradient += gradient[j] * gradient[j]
-            if size_of_gradient**0.5 <= 1e-14 + tolerance * max(size, size_of_momentum) ** 0.5:
-                failed[row] = False
-                break
-            for i in range(k3):
-                value += impulse[i] * impulse[i]
-            value = 0.5 * size + 0.5 * epsilon * value
-            _hessian(A[row], y, epsilon, H)
-            _descend(H, gradient, d)
-            slope = 0.0
-            for j in range(6):
-                slope += gradient[j] * d[j]
-            if -slope <= 1e-13 * value + 1e-22:  # no further fall within rounding
-                failed[row] = False
-                break
-            if not np.isfinite(slope):
-                break
-            for i in range(k3):
-                Ad[i] = 0.0
-                for j in range(6):
-                    Ad[i] += A[row, i, j] * d[j]
-            length = _step(y, Ad, v, d, slope, epsilon, flat_enough, search_steps, near, impulse)
-            for j in range(6):
-                v[j] += length * d[j]
+    for r in range(n):
+        solved, iterations = solve_row(
+            A[r], q[r], size, epsilon, primal[r], tolerance, most_iterations, flat_enough, search_steps, impulses[r], work
+        )
+        failed[r] = not solved
         most = max(most, iterations)
     return impulses, failed, most

@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 
 from processing.contact.physics.solver import FLAT_ENOUGH, MOST_ITERATIONS, SEARCH_STEPS
-from processing.contact.physics.solver_cpu import solve_rows
+from processing.contact.physics.solver_cpu import room, solve_row
 from recordings.constants import GRAVITY_M_S2
 
 SLOWEST_REBOUND_M_S = 0.03
@@ -53,26 +53,29 @@ def _fly(spin, velocity, inertia, inverse, step_s, work, out):
 @njit(cache=True, nogil=True)
 @no_type_check
 def _lowest(rotation, height_m, points, contacts, heights, index):
-    """The `contacts` lowest points: their numbers in `index`, their heights in `heights[index]`."""
+    """The `contacts` lowest points, lowest first: their numbers in `index`; the heights of all in `heights`."""
     for i in range(len(points)):
         p = points[i]
         heights[i] = rotation[2, 0] * p[0] + rotation[2, 1] * p[1] + rotation[2, 2] * p[2] + height_m
-    for c in range(contacts):
-        best = -1
-        for i in range(len(points)):
-            taken = False
-            for before in range(c):
-                taken = taken or index[before] == i
-            if not taken and (best < 0 or heights[i] < heights[best]):
-                best = i
-        index[c] = best
+    count = 0
+    for i in range(len(points)):
+        if count == contacts and not heights[i] < heights[index[contacts - 1]]:
+            continue
+        at = min(count, contacts - 1)
+        while at > 0 and heights[i] < heights[index[at - 1]]:
+            index[at] = index[at - 1]
+            at -= 1
+        index[at] = i
+        count = min(count + 1, contacts)
 
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def _problem(rotation, spin, velocity, points, heights, index, friction, restitution, root, root_mass, step_s, A, q):
-    """Rows A = J M^-1/2 and offsets q of the points that may touch; how many, and whether any impulse is needed."""
-    swept, speed = np.zeros(3), np.zeros(3)
+def _problem(
+    rotation, spin, velocity, points, heights, index, friction, restitution, root, root_mass, step_s, A, q, swept, speed
+):
+    """Rows A = J M^-1/2 and offsets q of the points that may touch; how many, and whether any impulse is needed.
+    `swept` and `speed` (3,) are room to work in."""
     count, needed = 0, False
     for i in index:
         arm = points[i]
@@ -86,15 +89,15 @@ def _problem(rotation, spin, velocity, points, heights, index, friction, restitu
         if normal < 0 and speed[2] < -SLOWEST_REBOUND_M_S:
             normal = speed[2] + min(gap, restitution * speed[2])
         row = 3 * count
-        q[0, row], q[0, row + 1], q[0, row + 2] = friction * speed[0], friction * speed[1], normal
+        q[row], q[row + 1], q[row + 2] = friction * speed[0], friction * speed[1], normal
         needed = needed or normal < friction * (speed[0] ** 2 + speed[1] ** 2) ** 0.5
         for a in range(3):
             share = 1.0 if a == 2 else friction
             _cross(arm, rotation[a], swept)
             for b in range(3):
-                A[0, row + a, b] = share * (swept[0] * root[0, b] + swept[1] * root[1, b] + swept[2] * root[2, b])
-                A[0, row + a, 3 + b] = 0.0
-            A[0, row + a, 3 + a] = share / root_mass
+                A[row + a, b] = share * (swept[0] * root[0, b] + swept[1] * root[1, b] + swept[2] * root[2, b])
+                A[row + a, 3 + b] = 0.0
+            A[row + a, 3 + a] = share / root_mass
         count += 1
     return count, needed
 
@@ -106,7 +109,7 @@ def _push(A, impulse, count, root, root_mass, spin, velocity, momentum):
     momentum[:] = 0.0
     for c in range(3 * count):
         for j in range(6):
-            momentum[j] += A[0, c, j] * impulse[c]
+            momentum[j] += A[c, j] * impulse[c]
     for j in range(3):
         spin[j] += root[j, 0] * momentum[0] + root[j, 1] * momentum[1] + root[j, 2] * momentum[2]
         velocity[j] += momentum[3 + j] / root_mass
@@ -144,7 +147,8 @@ def roll_rows(rotation, position, spin, velocity, owner, laws, points, inertia, 
     root, root_mass = np.linalg.cholesky(inverse), mass**0.5
     reach = np.sqrt((points**2).sum(1).max())
     heights, index = np.zeros(len(points)), np.zeros(contacts, dtype=np.int64)
-    A, q, primal = np.zeros((1, 3 * contacts, 6)), np.zeros((1, 3 * contacts)), np.zeros((1, 6))
+    A, q, primal = np.zeros((3 * contacts, 6)), np.zeros(3 * contacts), np.zeros(6)
+    impulse, inner = np.zeros(3 * contacts), room(3 * contacts)
     work, out, E, momentum, pushed = np.zeros(3), np.zeros(3), np.zeros((3, 3)), np.zeros(6), np.zeros(n)
     for r in range(n):
         R, w, v = rotation[r], spin[r], velocity[r]
@@ -155,21 +159,24 @@ def roll_rows(rotation, position, spin, velocity, owner, laws, points, inertia, 
             if position[r, 2] < reach * (1 + step_s * (w[0] ** 2 + w[1] ** 2 + w[2] ** 2) ** 0.5) - step_s * v[2]:
                 _lowest(R, position[r, 2], points, contacts, heights, index)
                 count, needed = _problem(
-                    R, w, v, points, heights, index, friction, restitution, root, root_mass, step_s, A, q
+                    R, w, v, points, heights, index, friction, restitution, root, root_mass, step_s, A, q, work, out
                 )
                 if needed:
-                    impulse, failed, _ = solve_rows(
-                        A[:, : 3 * count],
-                        q[:, : 3 * count],
+                    solved, _ = solve_row(
+                        A,
+                        q,
+                        3 * count,
                         EPSILON,
                         primal,
                         TOLERANCE,
                         MOST_ITERATIONS,
                         FLAT_ENOUGH,
                         SEARCH_STEPS,
+                        impulse,
+                        inner,
                     )
-                    failures += int(failed[0])
-                    pushed[r] += _push(A, impulse[0], count, root, root_mass, w, v, momentum)
+                    failures += not solved
+                    pushed[r] += _push(A, impulse, count, root, root_mass, w, v, momentum)
                 else:
                     primal[:] = 0.0
             _turn(R, w, step_s, E)
