@@ -151,9 +151,8 @@ def solve_row(A, q, size, epsilon, v, tolerance, most_iterations, flat_enough, s
         size_of_v = size_of_momentum = size_of_gradient = value = 0.0
         momentum[:] = 0.0
         for i in range(size):
-            if impulse[i] != 0.0:
-                for j in range(6):
-                    momentum[j] += A[i, j] * impulse[i]
+            for j in range(6):
+                momentum[j] += A[i, j] * impulse[i]
         for j in range(6):
             gradient[j] = v[j] - momentum[j]
             size_of_v += v[j] * v[j]
@@ -193,8 +192,9 @@ def solve_rows(A, q, epsilon, primal, tolerance, most_iterations, flat_enough, s
     impulses, failed, work = np.zeros((n, size)), np.ones(n, dtype=np.bool_), room(size)
     most = 0
     for r in range(n):
+        v, impulse = primal[r], impulses[r]
         solved, iterations = solve_row(
-            A[r], q[r], size, epsilon, primal[r], tolerance, most_iterations, flat_enough, search_steps, impulses[r], work
+            A[r], q[r], size, epsilon, v, tolerance, most_iterations, flat_enough, search_steps, impulse, work
         )
         failed[r] = not solved
         most = max(most, iterations)
