@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import torch
 from torch import Tensor
+from torch.optim.adam import adam
 
 from processing.field.encoding import EncodingName
 from processing.field.fuse import FuseConfig, Grid, fuse
@@ -107,20 +108,42 @@ def refined_views(
 def _optimise(
     model: ObjectField, poses: Poses, dataset: RayDataset, config: FieldConfig, progress: Progress
 ) -> tuple[float, ...]:
-    optimiser = torch.optim.Adam(_groups(model, config), betas=(0.9, 0.99), fused=True)
-    schedule = torch.optim.lr_scheduler.ExponentialLR(optimiser, 0.1 ** (1 / max(config.steps, 1)))
+    networks = [*model.encoding.parameters(), *model.geometry.parameters(), *model.appearance.parameters()]
+    warm = [model.warm_distance, model.warm_color]
+    groups = [Moments(networks, config.learning_rate), Moments(warm, config.warm_learning_rate)]
     losses = []
     for step in range(config.steps):
-        optimiser.zero_grad(set_to_none=True)
         loss = total_loss(model, poses, dataset, config)
         loss.backward()
-        optimiser.step()
-        schedule.step()
+        for group in groups:
+            group.step(decay=0.1 ** (1 / max(config.steps, 1)))
         if step % 10 == 0:
             losses.append(float(loss.detach()))
             progress.value("field loss", losses[-1], at=step)
         progress.step(config.pose_rounds + step + 1, config.pose_rounds + config.steps, "field: network")
     return tuple(losses)
+
+
+class Moments:
+    """Parameters, their learning rate and what Adam keeps of them (Kingma and Ba 2015; betas .9 and .99).
+
+    torch.optim.Adam would do the same steps, but importing torch._dynamo for it costs each process two CPU seconds.
+    """
+
+    def __init__(self, parameters: Sequence[Tensor], learning_rate: float) -> None:
+        self._parameters, self._rate = list(parameters), learning_rate
+        self._mean, self._square = ([torch.zeros_like(p) for p in self._parameters] for _ in range(2))
+        self._steps = [torch.zeros((), device=p.device) for p in self._parameters]
+
+    @torch.no_grad()
+    def step(self, decay: float) -> None:
+        """One step along the gradients, which are used up; the learning rate decays by this factor."""
+        gradients = [p.grad if p.grad is not None else torch.zeros_like(p) for p in self._parameters]
+        adam(self._parameters, gradients, self._mean, self._square, [], self._steps, fused=True, amsgrad=False,
+             beta1=0.9, beta2=0.99, lr=self._rate, weight_decay=0.0, eps=1e-8, maximize=False)  # fmt: skip
+        self._rate *= decay
+        for parameter in self._parameters:
+            parameter.grad = None
 
 
 Poses = tuple[Tensor, Tensor]
@@ -245,11 +268,3 @@ def eikonal_loss(distance_m: Tensor) -> Tensor:
     """Mean square of |gradient| - 1 from the distances at `eikonal_points`."""
     ahead, behind = distance_m.reshape(2, 3, -1)
     return ((ahead - behind).norm(dim=0) / (2 * EIKONAL_M) - 1).square().mean()
-
-
-def _groups(model: ObjectField, config: FieldConfig) -> list[dict[str, object]]:
-    networks = [*model.encoding.parameters(), *model.geometry.parameters(), *model.appearance.parameters()]
-    return [
-        {"params": networks, "lr": config.learning_rate},
-        {"params": [model.warm_distance, model.warm_color], "lr": config.warm_learning_rate},
-    ]
