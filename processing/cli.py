@@ -165,7 +165,7 @@ def _engine(args: argparse.Namespace, first: Path) -> Iterator[Engine]:
     elif jobs == 1:
         yield InTurn()
     else:
-        with SideBySide([Worker(board) for _ in range(jobs)], board) as engine:
+        with SideBySide([Worker(board, jobs) for _ in range(jobs)], board) as engine:
             yield engine
 
 

@@ -45,7 +45,9 @@ KERNELS: dict[tuple[str, str], list[tuple[str, ...]]] = {
     ("processing.track.appearance_ratio", "_appearance_at"): [(M4, M, M4, VI, V, V, F8, M)],
     ("processing.contact.physics.steps_cpu", "roll_rows"): [ROLL, (*ROLL[:5], f"{F8}[:,:]", *ROLL[6:])],
     ("processing.contact.physics.solver_cpu", "solve_rows"): [(T, M, F8, M, F8, I8, F8, I8)],
-    ("processing.field.fuse", "_integrate"): [(T4, T4, T4, T4, Q4, V4, F4, F4, M4, M4, M4, T4, MB, "uint8[:,:,:]", MB)],
+    ("processing.field.fuse", "_integrate"): [
+        (T4, T4, T4, T4, Q4, I8, V4, F4, F4, M4, M4, M4, T4, MB, "uint8[:,:,:]", MB)
+    ],
     ("processing.motion.se3_kernels", "exponential"): [(V,)],
     ("processing.motion.se3_kernels", "inverse"): [(M,)],
     ("processing.sensor.surface_kernel", "fit_surface"): [(M4, MB, V, I8, F8, M4, T4)],

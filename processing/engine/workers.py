@@ -18,6 +18,7 @@ from typing import Any
 
 from processing.engine.each import Task
 from processing.engine.outcome import Lost, Outcome, outcome_of
+from processing.engine.parts import allow_threads
 from recordings.progress import Board, Progress, Silent
 
 PRELOADED = ["processing.pipeline"]
@@ -26,10 +27,10 @@ TOLD_EVERY_S = 0.2
 
 
 class Worker:
-    """A process of our own; `board` shows how far its stage is."""
+    """A process of our own; `board` shows how far its stage is, `threads` compute its stage's parts (parts.py)."""
 
-    def __init__(self, board: Board) -> None:
-        self._board = board
+    def __init__(self, board: Board, threads: int = 1) -> None:
+        self._board, self._threads = board, threads
         self._process: Any = None
         self._pipe: Connection | None = None
         self._stopped = False
@@ -61,7 +62,9 @@ class Worker:
         if self._process is None:
             context = _context()
             self._pipe, theirs = context.Pipe()
-            self._process = context.Process(target=work, args=(theirs,), name="toss-process stages", daemon=True)
+            self._process = context.Process(
+                target=work, args=(theirs, self._threads), name="toss-process stages", daemon=True
+            )
             self._process.start()
             theirs.close()
         assert self._pipe is not None
@@ -91,13 +94,14 @@ _to_parent: Connection | None = None
 """In a worker: where to tell how far its stage is."""
 
 
-def work(pipe: Connection) -> None:
+def work(pipe: Connection, threads: int) -> None:
     """What a worker does: computes what it is sent, until nothing is sent any more."""
     global _to_parent
     _to_parent = pipe
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     _quiet()
+    allow_threads(threads)
     while True:
         try:
             call = pipe.recv_bytes()

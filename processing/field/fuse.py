@@ -17,9 +17,12 @@ from numpy import ndarray as Array
 from scipy import ndimage
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
+from processing.engine.parts import in_parts
 from processing.field.views import FieldView, object_box
 from recordings.tracks import ObjectShape
 
+PART = 8
+"""Layers of the grid that are fused in one part of the work."""
 BEHIND_FULL = np.float32(0.3)
 """Cells further behind a surface than this share of the truncation count less and less: near an edge they belong to
 another face (weighed fully they bulge it out; weighed down from the surface on, noisy poses shrink the object)."""
@@ -74,24 +77,25 @@ def fuse(views: Sequence[FieldView], config: FuseConfig, prior_shape: ObjectShap
     passed = np.zeros(shape, dtype=np.float32)
     blocked = np.zeros(shape, dtype=np.float32)
     paint = np.zeros((*shape, 4), dtype=np.float32)
-    for view in views:
-        _integrate(
-            total,
-            weight,
-            passed,
-            blocked,
-            paint,
-            low.astype(np.float32),
-            np.float32(voxel_m),
-            np.float32(config.truncation_m),
-            view.camera_from_object_at_depth.astype(np.float32),
-            view.K.astype(np.float32),
-            view.depth_m,
-            view.plane,
-            view.outside,
-            view.color_rgb,
-            view.inside if view.colorless is None else view.inside & ~view.colorless,
-        )
+
+    def integrate(part: slice) -> None:
+        for view in views:
+            _integrate(
+                *(total[part], weight[part], passed[part], blocked[part], paint[part]),
+                part.start,
+                low.astype(np.float32),
+                np.float32(voxel_m),
+                np.float32(config.truncation_m),
+                view.camera_from_object_at_depth.astype(np.float32),
+                view.K.astype(np.float32),
+                view.depth_m,
+                view.plane,
+                view.outside,
+                view.color_rgb,
+                view.inside if view.colorless is None else view.inside & ~view.colorless,
+            )
+
+    in_parts(integrate, shape[0], PART)
     free = passed > np.maximum(2.0, 0.2 * blocked)
     sdf_m = np.where(weight > 0, total / np.maximum(weight, 1e-9), 0).astype(np.float32)
     rgb = paint[..., :3] / np.maximum(paint[..., 3:], 1e-9)
@@ -113,14 +117,15 @@ def _spread(rgb: Float32[Array, "a b c 3"], known: Bool[Array, "a b c"]) -> Floa
 @numba.njit(cache=True, nogil=True, fastmath=True)
 @no_type_check  # numba cannot cache what the tests' type checker wraps
 def _integrate(
-    total, weight, passed, blocked, paint, low, voxel, truncation, pose, K, depth, plane, outside, rgb, colored
+    total, weight, passed, blocked, paint, first, low, voxel, truncation, pose, K, depth, plane, outside, rgb, colored
 ):
-    """One view into the sums. Cells are walked along the last axis; all lengths in metres."""
+    """One view into the sums, which begin at layer `first` of the grid. Cells are walked along the last axis; all
+    lengths in metres."""
     height, width = depth.shape
     n0, n1, n2 = total.shape
     step0, step1, step2 = pose[0, 2] * voxel, pose[1, 2] * voxel, pose[2, 2] * voxel
     for i in range(n0):
-        a = low[0] + voxel * i
+        a = low[0] + voxel * (first + i)
         for j in range(n1):
             b = low[1] + voxel * j
             x = pose[0, 0] * a + pose[0, 1] * b + pose[0, 2] * low[2] + pose[0, 3]

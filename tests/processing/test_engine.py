@@ -22,6 +22,7 @@ import pytest
 from processing.engine import jobs
 from processing.engine.each import InTurn, SideBySide, Task
 from processing.engine.outcome import Fault, Lost, Outcome, outcome_of, raise_if_told
+from processing.engine.parts import allow_threads, in_parts
 from processing.engine.workers import Worker
 from processing.store import Store
 from recordings.errors import BadInput, TosslabError, WriteFailed
@@ -255,7 +256,7 @@ def gone(process: int) -> bool:
         return True
 
 
-def wait_for(what: Callable[[], bool], seconds: float = 120) -> None:
+def wait_for(what: Callable[[], bool], seconds: float = 300) -> None:
     until = time.monotonic() + seconds
     while not what():
         assert time.monotonic() < until, "waited in vain"
@@ -326,9 +327,40 @@ if __name__ == "__main__":
     sys.path.insert(0, sys.argv[3])
     from compile_kernels import unforeseen
     assert not unforeseen(), unforeseen()
-    with SideBySide([Worker(board), Worker(board)], board) as engine:
+    with SideBySide([Worker(board, 2), Worker(board, 2)], board) as engine:
         rows(engine, out / "two")
 """
+
+
+@pytest.fixture
+def threads() -> Iterator[Callable[[int], None]]:
+    """`threads(n)` for this test alone."""
+    yield allow_threads
+    allow_threads(1)
+
+
+def test_parts_are_cut_alike_and_come_in_order_whatever_the_number_of_threads(
+    threads: Callable[[int], None],
+) -> None:
+    def late(part: slice) -> tuple[int, int]:
+        time.sleep(0.002 * (20 - part.start))
+        return part.start, part.stop
+
+    for count in (1, 3):
+        threads(count)
+        assert in_parts(late, 20, 8) == [(0, 8), (8, 16), (16, 20)]
+        assert in_parts(late, 0, 8) == []
+
+
+def test_what_fails_in_a_part_fails_as_it_would_alone(threads: Callable[[int], None]) -> None:
+    def fails(part: slice) -> None:
+        if part.start:
+            raise BadInput("no depth here")
+
+    for count in (1, 2):
+        threads(count)
+        with pytest.raises(BadInput, match="no depth here"):
+            in_parts(fails, 3, 1)
 
 
 def test_two_jobs_leave_the_same_bytes_as_one(record_tiny: Any, tmp_path: Path) -> None:

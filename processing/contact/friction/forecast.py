@@ -19,10 +19,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 from numpy import ndarray as Array
 
 from processing.contact.physics.loss import REFERENCE_MASS_KG
+from processing.engine.parts import in_parts
 from processing.motion.phases import Noise
 from processing.motion.smoother import FLIGHT_CHANGE_M_S, FLIGHT_CHANGE_RAD_S
 from processing.motion.trajectory import rotation_matrices, rotation_vectors
@@ -88,6 +89,8 @@ def _sigma_points() -> Float[Array, "s 12"]:
 
 SIGMA_POINTS = _sigma_points()
 MEMBERS = len(SIGMA_POINTS)
+PART = 48
+"""States that are rolled on in one part of the work."""
 LONGEST = 400
 _half = np.random.default_rng(5).standard_normal((LONGEST, MEMBERS // 2, 12))
 DRAWN = np.concatenate([_half, -_half], 1)
@@ -238,8 +241,6 @@ def _rolled(
     laws: Float[Array, "m 2"],
 ) -> tuple[list[Float[Array, "m a s ..."]], Float[Array, "m a s"]]:
     """The members after dt, and each one's change of speed by contact."""
-    from processing.contact.physics.steps_cpu import roll_rows
-
     m, a, s = parts[1].shape[:3]
     push, whole = np.zeros((m, a, s)), [np.array(p) for p in parts]
     steps = np.maximum(np.round(dt / STEP_S), 1).astype(int)
@@ -247,14 +248,32 @@ def _rolled(
         chosen = np.flatnonzero(steps == count)
         rows = [np.ascontiguousarray(p[:, chosen].reshape(-1, *p.shape[3:])) for p in whole]
         owner = np.repeat(np.arange(m), len(chosen) * s)
-        contacts = min(body.contacts, len(body.points_m))
-        step_s = float(dt[chosen].mean()) / int(count)
-        inertia, points = body.inertia_kgm2, body.points_m
-        done, _ = roll_rows(*rows, owner, laws, points, inertia, REFERENCE_MASS_KG, contacts, int(count), step_s)
+        done = _roll_in_parts(rows, owner, laws, body, int(count), float(dt[chosen].mean()) / int(count))
         push[:, chosen] = done.reshape(m, len(chosen), s)
         for values, moved in zip(whole, rows):
             values[:, chosen] = moved.reshape(m, len(chosen), *values.shape[2:])
     return whole, push
+
+
+def _roll_in_parts(
+    rows: Sequence[Float[Array, "r ..."]],
+    owner: Int64[Array, " r"],
+    laws: Float[Array, "m 2"],
+    body: RigidBody,
+    steps: int,
+    step_s: float,
+) -> Float[Array, " r"]:
+    """Rolls states on in place; each one's change of speed by contact."""
+    from processing.contact.physics.steps_cpu import roll_rows
+
+    contacts = min(body.contacts, len(body.points_m))
+
+    def roll(part: slice) -> Float[Array, " p"]:
+        some, whose = [values[part] for values in rows], owner[part]
+        fixed = (laws, body.points_m, body.inertia_kgm2, REFERENCE_MASS_KG, contacts, steps, step_s)
+        return roll_rows(*some, whose, *fixed)[0]
+
+    return np.concatenate(in_parts(roll, len(owner), PART))
 
 
 def _disturb(covariance: Float[Array, "m a 12 12"], dt: Float[Array, " a"]) -> None:
