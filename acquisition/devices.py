@@ -223,6 +223,8 @@ class Health:
     message: str = ""
     received: Mapping[str, int] = field(default_factory=dict)
     dropped: Mapping[str, int] = field(default_factory=dict)
+    absent: bool = False
+    """Nothing is to be expected of it in this toss: a recording that does not hold it."""
 
 
 @runtime_checkable

@@ -120,6 +120,12 @@ class Player:
             self._played_ns = passed_ns + last_ns - first_ns + round(LEAD_S * 1e9)
             self._ends_ns = self._starts_ns + last_ns - first_ns
 
+    def lacks(self, device: str) -> bool:
+        """Whether the toss that is played holds nothing of a device."""
+        with self._lock:
+            track = self._tracks.get(device)
+            return bool(self._tracks) and (track is None or not track.cues)
+
     def over(self) -> bool:
         """Whether everything of the toss has been delivered, for a moment."""
         with self._lock:
@@ -151,8 +157,10 @@ class Player:
     def _images(self, toss: Toss, name: str) -> list[_Cue]:
         base = self._next_number.get(name, 0)
         rgbd = f"/{name}/color" in toss.file.channels
-        frames = toss.color(name) if rgbd else toss.mono(name)
         topic = f"/{name}/color" if rgbd else f"/{name}/image"
+        if topic not in toss.file.channels:
+            return []  # another toss has it
+        frames = toss.color(name) if rgbd else toss.mono(name)
         log_ns = toss.file.topic_index(topic).log_time_ns
         depth_topic = f"/{name}/depth"
         depths = {int(t): k for k, t in enumerate(toss.file.topic_index(depth_topic).log_time_ns)} if rgbd else {}
@@ -247,7 +255,7 @@ class _Replayed(OpenedByContext):
         self.stop()
 
     def health(self) -> Health:
-        return Health(received={self.name: self._received})
+        return Health(received={self.name: self._received}, absent=self._player.lacks(self.name))
 
     def describe(self) -> dict[str, Any]:
         recorded_rig = self._player.session.start.get("rig", {})

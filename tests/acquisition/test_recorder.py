@@ -263,6 +263,21 @@ def test_a_killed_session_goes_on_by_resume(after_s: float, rig: str, tmp_path: 
     assert starts == sorted(starts)
 
 
+def test_every_toss_of_a_session_is_replayed_though_its_cameras_are_not_in_all_of_them(
+    sample_path: Path, tmp_path: Path
+) -> None:
+    again = tmp_path / "again"
+    assert main(["--rig", f"replay:{sample_path}", "--tosses", "4", "--yes", str(again)]) == 0
+    with Session.open(sample_path) as a, Session.open(again) as b:
+        assert b.tosses == (0, 1, 2, 3)
+        for toss in b.tosses:
+            before, after = a.toss(toss).streams(), b.toss(toss).streams()
+            for topic in ("/d455/color", "/d455/depth"):
+                assert after[topic].count == before[topic].count
+        assert b.toss(0).streams()["/mono2/image"].count == 36
+    assert verify(again).ok
+
+
 @pytest.mark.slow
 def test_a_replayed_session_is_recorded_again(rig: str, tmp_path: Path) -> None:
     first, again = tmp_path / "first", tmp_path / "again"
