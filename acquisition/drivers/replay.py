@@ -123,8 +123,7 @@ class Player:
     def lacks(self, device: str) -> bool:
         """Whether the toss that is played holds nothing of a device."""
         with self._lock:
-            track = self._tracks.get(device)
-            return bool(self._tracks) and (track is None or not track.cues)
+            return bool(self._tracks) and not self._tracks.get(device, _Track()).cues
 
     def over(self) -> bool:
         """Whether everything of the toss has been delivered, for a moment."""
