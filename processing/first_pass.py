@@ -1,4 +1,4 @@
-"""Do the tosses that were brought into one object frame show one shape there?
+"""The first pass over all tosses (P, O): one object frame, one shape; do all tosses show that shape there?
 
 A registration can fit what two tosses see in common and still be wrong by a symmetry (a prism's faces look alike); then
 their frames fused together explain neither.
@@ -10,11 +10,44 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from processing import stage_notices as say
 from processing.images import Images
+from processing.passes import Pass
 from processing.run import Run, each
+from processing.stages.field import learn_field
 from processing.stages.fuse import fuse_frames
 from processing.stages.judge import judge, residuals
+from processing.stages.place import place_shape
+from processing.stages.register import register
 from processing.store import Done
+from processing.variants import refuse_baseline
+
+
+def first_pass(run: Run, alone: Mapping[int, Done], images: Mapping[int, Images]) -> Pass:
+    """P, O: all tosses in one object frame, and one shape. Tosses that the shape of all does not explain are kept
+    apart, and the others joined anew: they were refined together with the wrong ones."""
+    refuse_baseline(run.tracker)
+    tosses, warnings = run.tosses, list(say.of_tracks(alone))
+    while True:
+        placed = register(run, {t: alone[t] for t in tosses}, images)
+        joined = [t for t in tosses if t not in placed.result.not_joined]
+        shape = learn_field(run, "all tosses", dict.fromkeys(joined, placed), images)
+        apart = kept_apart(run, placed, shape, images, joined)
+        if not apart:
+            warnings += say.of_register(placed)
+            return Pass(dict.fromkeys(tosses, placed), dict.fromkeys(tosses, shape),
+                        shared_frame=tosses == run.tosses, warnings=tuple(warnings))  # fmt: skip
+        warnings.append(say.kept_apart(apart))
+        tosses = tuple(t for t in tosses if t not in apart)
+
+
+def start_alone(run: Run, toss: int, first: Pass, alone: Done, images: Mapping[int, Images]) -> Pass:
+    """Where the cycle begins on one toss: p_i, and O in its object frame. A toss that is lost in P does not say how O
+    lies in it (it may be another object's): its own shape is taken."""
+    placed: Done = place_shape(run, toss, first.tracks[toss], alone, first.shapes[toss])
+    lost = not placed.result.frames
+    shape = learn_field(run, f"toss {toss}", {toss: alone}, images) if lost else placed
+    return Pass({toss: alone}, {toss: shape}, shared_frame=False, warnings=say.lost_among_all(toss) if lost else ())
 
 
 def kept_apart(
