@@ -27,7 +27,7 @@ from recordings.results.live import LineReader, live_folder, read_state
 
 POLL_S, FEED_S = 0.2, 0.002
 CAMERA = "d455"
-FAR_APART_NS = 20_000_000
+MOST_GAP_NS = 20_000_000
 FOLLOWER, VIEWER = "processing.cli", "recordings.cli_view"
 NO_DISPLAY = "live: there is no display here; elsewhere on this machine: toss-view --live {session}"
 
@@ -172,12 +172,12 @@ def newest_frame(recorder: Records) -> LiveFrame | None:
     if color is None or depth is None or not thumbnails or thumbnails[-1].number != depth.number:
         return None
     depth_ns = thumbnails[-1].time_ns
-    apart_ns = color.mid_exposure_ns - depth.mid_exposure_ns
-    if abs(apart_ns) > FAR_APART_NS:  # of two frames, one of which is not there yet
+    gap_ns = color.mid_exposure_ns - depth.mid_exposure_ns
+    if abs(gap_ns) > MOST_GAP_NS:  # of two frames, one of which is not there yet
         return None
     host_ns = max(color.host_ns, depth.host_ns)
     return LiveFrame(
-        color.number, depth_ns + apart_ns, depth_ns, host_ns, color.pixels, depth.pixels, thumbnails[-1].unit_m
+        color.number, depth_ns + gap_ns, depth_ns, host_ns, color.pixels, depth.pixels, thumbnails[-1].unit_m
     )
 
 

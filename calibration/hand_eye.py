@@ -38,7 +38,7 @@ GOOD_PX, WORST_PX = 0.5, 3.0
 FOLDS = 4
 HUBER = 2.5
 STEPS = 30
-ROUNDS, GROWS = 6, 1.05
+ROUNDS, CONVERGED_RATIO = 6, 1.05
 DIFFERENCE, POSE_DIFFERENCE = 1e-7, 1e-4
 
 
@@ -118,7 +118,7 @@ def missing_motion(moved: Float[Array, "n 4 4"]) -> list[str]:
             f"the robot turned by {span:.0f} deg at most between poses, wanted {LEAST_TURN_DEG:.0f} or more (45 is "
             "good): turn the tool about two different axes, for instance roll +-30 deg and pitch +-30 deg"
         ]
-    vectors = _relative_turns(moved)
+    vectors = _relative_rotations(moved)
     values, axes = np.linalg.eigh(vectors.T @ vectors)
     if np.sqrt(values[1] / values[2]) < LEAST_SECOND_AXIS:
         axis = axes[:, 2]
@@ -131,14 +131,14 @@ def missing_motion(moved: Float[Array, "n 4 4"]) -> list[str]:
     return []
 
 
-def _relative_turns(moved: Float[Array, "n 4 4"]) -> Float[Array, "m 3"]:
+def _relative_rotations(moved: Float[Array, "n 4 4"]) -> Float[Array, "m 3"]:
     first, second = np.triu_indices(len(moved), 1)
     turns = np.swapaxes(moved[first, :3, :3], 1, 2) @ moved[second, :3, :3]
     return Rotation.from_matrix(turns).as_rotvec()
 
 
 def _span_deg(moved: Float[Array, "n 4 4"]) -> float:
-    return float(np.degrees(np.linalg.norm(_relative_turns(moved), axis=1).max(initial=0.0)))
+    return float(np.degrees(np.linalg.norm(_relative_rotations(moved), axis=1).max(initial=0.0)))
 
 
 def _board_poses(model: CameraModel, views: Sequence[TargetView]) -> tuple[Float[Array, "n 4 4"], list[int]]:
@@ -270,7 +270,7 @@ def _refine(observations: _Observations, start: tuple[Array, Array], arm: ArmAcc
         arm = _measured_arm(solved, assumed, len(observations.views))
         solved = _solve(observations, (solved.camera_from_mount, solved.held_from_board), arm)
         worse = _measured_arm(solved, assumed, len(observations.views))
-        if worse.turn_deg < GROWS * arm.turn_deg and worse.shift_m < GROWS * arm.shift_m:
+        if worse.turn_deg < CONVERGED_RATIO * arm.turn_deg and worse.shift_m < CONVERGED_RATIO * arm.shift_m:
             break
     return solved
 

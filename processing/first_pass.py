@@ -76,11 +76,11 @@ def _unexplained(
     """Tosses whose outline the shape does not explain, although their own frames alone do."""
     limit = run.config.cycle.apart_mask
     left = _left(run, together, dict.fromkeys(tosses, shape), images)
-    odd = [t for t in tosses if left[t] > limit]
-    if not odd:
+    unexplained = [t for t in tosses if left[t] > limit]
+    if not unexplained:
         return []
-    alone = _left(run, together, each(run, odd, lambda t: fuse_frames(run, together, images, [t])), images)
-    return [t for t in odd if left[t] > alone[t] + 0.5 * limit]
+    alone = _left(run, together, each(run, unexplained, lambda t: fuse_frames(run, together, images, [t])), images)
+    return [t for t in unexplained if left[t] > alone[t] + 0.5 * limit]
 
 
 def _left(run: Run, together: Done, shapes: Mapping[int, Done], images: Mapping[int, Images]) -> dict[int, float]:

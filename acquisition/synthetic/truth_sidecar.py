@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 SUFFIX = "_truth"
 
 
-def write_beside(lab: LabState, session: Path) -> Path | None:
+def write_sidecar(lab: LabState, session: Path) -> Path | None:
     """True poses at the frames of every toss that this lab played, exposure times, shape and physics."""
     if not lab.show.rendered:
         return None
@@ -79,7 +79,7 @@ def _write_toss(lab: LabState, toss: Toss, folder: Path) -> None:
 def stamp_errors_ms(session: Path, truth: Path) -> dict[str, Float[Array, " n"]]:
     """By topic and over all tosses: stamps, with the offsets that `toss-calibrate time` found, less true mid-exposures.
 
-    Of a session that one run of toss-record wrote; `truth` is what `write_beside` wrote.
+    Of a session that one run of toss-record wrote; `truth` is what `write_sidecar` wrote.
     """
     opened = Session.open(session)
     anchor = opened.start["clock"]["anchor"]

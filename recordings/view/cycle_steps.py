@@ -93,7 +93,7 @@ class TossCycle:
     rollout: Rollout | None
 
     @property
-    def tells_something(self) -> bool:
+    def has_passes(self) -> bool:
         """More than the result itself."""
         first = self.steps[0]
         return len(self.steps) > 1 or bool(first.learned or first.judged or self.rollout)
@@ -103,7 +103,7 @@ def read_cycle(results: Results, record: VariantRecord) -> dict[int, TossCycle]:
     """Of each toss of a variant what is known of its passes. Raises DamagedFile for files that cannot be read."""
     reader = _Reader(results, record)
     found = {t.toss: reader.toss(t.toss, t.track, t.shape or record.shape) for t in record.tosses}
-    return {t: cycle for t, cycle in found.items() if cycle.tells_something}
+    return {t: cycle for t, cycle in found.items() if cycle.has_passes}
 
 
 class _Reader:

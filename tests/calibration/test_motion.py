@@ -159,11 +159,11 @@ def test_an_offset_from_tag_corners_is_found_to_a_fraction_of_a_millisecond(geom
     model = geometry.camera("d455", 500.0, (848, 640))
     camera = geometry.pose([np.pi, 0, 0], [-0.1, 0.1, 1.5])
     frames = corner_frames(geometry, model, camera, at, times[2:-4:2] + 0.009, 0.0062, np.random.default_rng(3))
-    course = Path3.of_poses(times, poses)
+    trajectory = Path3.of_poses(times, poses)
     crooked = geometry.pose([0.001, -0.001, 0.0005], [0.001, 0.001, -0.002]) @ camera
-    found = offset_of_corners(course, model, crooked, frames)
+    found = offset_of_corners(trajectory, model, crooked, frames)
     assert abs(found.offset_s - 0.0062) < 0.0003
-    place = place_by_motion(course, model, frames)
+    place = place_by_motion(trajectory, model, frames)
     mm, deg = off(place, camera)
     assert mm < 3.0
     assert deg < 0.1
@@ -249,11 +249,11 @@ def test_gravity_comes_out_of_free_flight_of_a_point_off_the_centre(geometry):
     carried = poses.copy()
     carried[:, :3, 3] += poses[:, :3, :3] @ [0.004, -0.003, 0.002]
     carried[:, :3, 3] += 0.0002 * rng.normal(size=(len(times), 3))
-    course = Path3.of_poses(times, carried)
-    flight = find_flight(course, 0.25)
+    trajectory = Path3.of_poses(times, carried)
+    flight = find_flight(trajectory, 0.25)
     assert flight.start >= 8
     assert flight.stop <= 24 or flight.start >= 22  # before the bounce or after it, never across
-    found = gravity_from_flight(course, flight)
+    found = gravity_from_flight(trajectory, flight)
     assert np.degrees(np.arccos(-found.down[2])) < max(0.5, 3 * found.std_deg)
     assert found.size_m_s2 == pytest.approx(9.81, rel=0.02)
     level = Plane(np.array([0.0, 0, 1]), 0.0, 1e-4, 0.01)

@@ -29,7 +29,7 @@ from recordings.tracks import ObjectTrack
 def stages(
     tiny_world: Any, run: Run, folder: Path, turned: int | None, narrower_px: int = 0
 ) -> tuple[Done, dict[int, Images]]:
-    """True poses as the stage of all tosses, one of them turned about the object's middle, and true masks (or narrower
+    """True poses as the stage of all tosses, one of them turned about the object's centre, and true masks (or narrower
     ones)."""
     tracks, images = folder / "register-0", {}
     tracks.mkdir(parents=True)

@@ -204,8 +204,8 @@ class Follower:
             return self._over("aborted", self._stop_reason() or "the controller takes no more positions")
         if self._brake is not None and self._brake.standing:
             return self._over("aborted", "halted")
-        settled = self._place > len(self._path) + 3 * self._options["lookahead_s"] * self._rate_hz
-        return self._over("done", "") if settled else False
+        arrived = self._place > len(self._path) + 3 * self._options["lookahead_s"] * self._rate_hz
+        return self._over("done", "") if arrived else False
 
     def _servo(self, q: Float[Array, "6"]) -> bool:
         options = self._options

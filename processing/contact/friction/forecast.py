@@ -220,15 +220,15 @@ def _add(covariance: Float[Array, "*b 12 12"], rows: slice, columns: slice, valu
 def _predicted(states: _States, dt: Float[Array, " a"], body: RigidBody, laws: Float[Array, "m 2"]) -> _States:
     """The states after dt: their sigma points rolled on."""
     rolled, _ = _rolled(_members(states), dt, body, laws)
-    middle = rolled[0][:, :, 0].copy()
+    mean = rolled[0][:, :, 0].copy()
     for _ in range(2):
-        middle = middle @ rotation_matrices(_turns(middle, rolled[0]).mean(2))
-    turns = _turns(middle, rolled[0])
+        mean = mean @ rotation_matrices(_rotation_vectors(mean, rolled[0]).mean(2))
+    turns = _rotation_vectors(mean, rolled[0])
     position, spin, velocity = means = [values.mean(2) for values in rolled[1:]]
     parts = [turns - turns.mean(2, keepdims=True), *(v - mean[:, :, None] for v, mean in zip(rolled[1:], means))]
     error = np.concatenate(parts, -1)
     covariance = np.einsum("masi,masj->maij", error, error) / MEMBERS
-    return _States(middle, position, spin, velocity, covariance)
+    return _States(mean, position, spin, velocity, covariance)
 
 
 def _rolled(
@@ -286,6 +286,6 @@ def _corrected(
     )
 
 
-def _turns(middle: Float[Array, "m a 3 3"], rotation: Float[Array, "m a s 3 3"]) -> Float[Array, "m a s 3"]:
+def _rotation_vectors(mean: Float[Array, "m a 3 3"], rotation: Float[Array, "m a s 3 3"]) -> Float[Array, "m a s 3"]:
     """Rotation vectors from the middle to each."""
-    return rotation_vectors(np.swapaxes(middle, -1, -2)[:, :, None] @ rotation)
+    return rotation_vectors(np.swapaxes(mean, -1, -2)[:, :, None] @ rotation)

@@ -76,9 +76,9 @@ def measured_fall(tosses: Sequence[PoseSeries]) -> Fall | None:
     if len(found) < 3:
         return None
     values, errors = np.array([f.value for f in found]), np.array([f.error for f in found])
-    middle = float(np.median(values))
-    spread = MAD_TO_SIGMA * float(np.median(np.abs(values - middle)))  # at 30 Hz some windows are bounces, and scatter
-    return Fall(middle, 1.25 * max(spread, float(np.sqrt((errors**2).mean()))) / len(found) ** 0.5)
+    median = float(np.median(values))
+    spread = MAD_TO_SIGMA * float(np.median(np.abs(values - median)))  # at 30 Hz some windows are bounces, and scatter
+    return Fall(median, 1.25 * max(spread, float(np.sqrt((errors**2).mean()))) / len(found) ** 0.5)
 
 
 def _falls(series: PoseSeries) -> list[Fall]:
