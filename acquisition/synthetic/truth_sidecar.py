@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray as Array
 
+from recordings.bounded.documents import read_json
 from recordings.session import Session, Toss
 from recordings.sync import clock_offset_ns
 
@@ -87,8 +88,8 @@ def stamp_errors_ms(session: Path, truth: Path) -> dict[str, Float[Array, " n"]]
     errors: dict[str, list[float]] = {}
     for number in opened.tosses:
         folder = truth / f"toss_{number:02d}"
-        first_host_ns = json.loads((folder / "toss_gt.json").read_text())["first_color_exposed_host_ns"]
-        exposures = json.loads((folder / "exposures_ns.json").read_text())
+        first_host_ns = read_json(folder / "toss_gt.json")["first_color_exposed_host_ns"]
+        exposures = read_json(folder / "exposures_ns.json")
         for topic, exposed_ns in exposures.items():
             stream = "mono" if topic.startswith("/mono") else "d455"
             offset_ns = clock_offset_ns(opened.calibration.residuals, stream)

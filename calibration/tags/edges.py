@@ -154,7 +154,7 @@ def _model(
 def _intersect(
     edges: _Edges, fit: Float[Array, "e 7"], information: Float[Array, "e 7 7"]
 ) -> tuple[Float[Array, "n 4 2"], Float[Array, "n 4 2 2"]]:
-    """Corner k is where edge k - 1 and edge k meet: n . x = n . midpoint + a + b (t . (x - midpoint)) / half for both."""
+    """Corner k is where edges k - 1 and k meet: n . x = n . m + a + b (t . (x - m)) / half for both, m: midpoint."""
     covariance = np.linalg.pinv(information, hermitian=True)[:, :2, :2]
     n = len(fit) // 4
     slope = fit[:, 1] / edges.half

@@ -1,10 +1,10 @@
 """A rigid body with tags whose layout is not known, seen by calibrated or uncalibrated cameras: layout, poses, cameras.
 
-    solved = solve_tagged_object(models, sightings, size_m, camera_from_rig)
+    solved = solve_tagged_object(models, detections, size_m, camera_from_rig)
 
 Tags that are seen together give their relative pose (of each tag's two possible poses the pair that many images agree
-on); from the layout solved tag by tag in that way follow the body's poses, from these the cameras where they are not known, and one
-bundle adjustment settles everything.
+on), and the layout tag by tag. From it follow the body's poses, from these the cameras where they are not known; one
+bundle adjustment refines everything.
 """
 
 from __future__ import annotations
@@ -216,7 +216,7 @@ def _observations(
 
 
 def _without_outliers(scene: Scene, seen: Observations) -> tuple[Solved, Observations, int]:
-    """Solve, drop sightings that fit nothing, solve again."""
+    """Solve, drop detections that fit nothing, solve again."""
     solved = adjust(scene, seen)
     worst = np.sqrt((solved.residual_px**2).sum(axis=1).reshape(-1, 4).mean(axis=1))
     keep = np.repeat(worst < WRONG_TAG_PX, 4)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -35,6 +34,7 @@ from processing.store import Store
 from recordings.errors import BadInput
 from recordings.progress import Progress
 from recordings.results.folder import VariantRecord, write_contact, write_shape, write_variant
+from recordings.results.stage_files import stage_document
 from recordings.tracks import ObjectShape
 from recordings.whole_file import write_json
 
@@ -121,7 +121,7 @@ def learn_contact_only(
         ContactOnlyResult,
         compute,
     )
-    document = json.loads((done.folder / "result.json").read_text())
+    document = stage_document(done.folder / "result.json")
     files = {
         "folder": str(done.folder),
         "plot": str(done.folder / "rollout.png"),
