@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import time
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,7 +14,7 @@ import numpy as np
 import torch
 
 from processing.contact.learn.convexity import CLASSES, ClassName
-from processing.contact.learn.data_checks import check_frames, duplicate_groups, refuse_leaks
+from processing.contact.learn.data_checks import check_frames, duplicate_groups, of_own_tracks, refuse_leaks
 from processing.contact.learn.fit import FitConfig
 from processing.contact.learn.from_tracks import TracksConfig, learn_from_series
 from processing.contact.learn.learn import ContactConfig, ContactLearning, learn_contact
@@ -85,7 +86,8 @@ def learn_contact_only(
     config = ContactConfig(fit=FitConfig(device=device, friction_start=0.03), rollout_steps=steps)
 
     def compute(folder: Path) -> ContactOnlyResult:
-        learning, shape, extra = _learn(train, geometry, init_m, source, given, plane, config, progress)
+        with of_own_tracks() if source.of_vision else nullcontext():
+            learning, shape, extra = _learn(train, geometry, init_m, source, given, plane, config, progress)
         evaluation = evaluate(learning, [tracks[t] for t in tested], plane, steps, STEP_S, "thrown")
         document, more = result_document(learning, evaluation), _warnings(geometry, source, wanted, steps)
         document |= {
