@@ -9,7 +9,7 @@ LEFT_AFTER_S = 2.0
 
 
 class SideThread:
-    """Calls `step` every so often, from the start of its context to the end, which waits for it LEFT_AFTER_S at most."""
+    """Calls `step` every so often, from the start of its context to the end, which waits LEFT_AFTER_S at most."""
 
     def __init__(self, name: str, every_s: float, step: Callable[[], None]) -> None:
         self._every_s, self._step, self._stop = every_s, step, threading.Event()
