@@ -9,9 +9,9 @@ being free within what the arm is known for.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from typing import Literal
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -50,6 +50,27 @@ class ArmAccuracy:
     shift_m: float = 0.0003
 
 
+@dataclass(frozen=True)
+class LensAccuracy:
+    """Standard deviations of a lens, as `toss-calibrate intrinsics` states them; 0 where nothing is stated."""
+
+    focal_percent: float = 0.0
+    principal_point_px: float = 0.0
+
+    @staticmethod
+    def stated(uncertainty: Mapping[str, Any]) -> LensAccuracy:
+        """From a report of intrinsics."""
+        return LensAccuracy(*(float(uncertainty.get(f.name) or 0.0) for f in fields(LensAccuracy)))
+
+    def others(self, model: CameraModel) -> list[CameraModel]:
+        """Lenses one standard deviation off: in both focal lengths, and in each axis of the principal point."""
+        longer = 1 + self.focal_percent / 100
+        side_px = self.principal_point_px / np.sqrt(2)
+        changes = [np.diag([model.fx, model.fy, 0.0]) * (longer - 1), *(np.zeros((3, 3)) for _ in range(2))]
+        changes[1][0, 2] = changes[2][1, 2] = side_px
+        return [replace(model, K=model.K + change) for change in changes if change.any()]
+
+
 @dataclass(frozen=True, eq=False)
 class HandEye:
     """`camera_from_mount`: camera_from_base (eye-to-hand) or camera_from_tool (eye-in-hand); `held_from_board`:
@@ -70,13 +91,15 @@ def calibrate_hand_eye(
     base_from_tool: Float[Array, "n 4 4"],
     mounting: Mounting,
     arm: ArmAccuracy | None = None,
+    lens: LensAccuracy | None = None,
 ) -> HandEye:
-    """From one view of the board per robot pose. Views without the board are left out.
+    """From one view of the board per robot pose. Views without the board are left out. The lens is kept as given; how
+    far another one within its accuracy would move the camera counts into the covariance.
 
     Raises BadInput where too few views show it. Too little rotation is a refusal in the report, with the motion that is
     missing.
     """
-    arm = arm or ArmAccuracy()
+    arm, lens = arm or ArmAccuracy(), lens or LensAccuracy()
     camera_from_board, used = _board_poses(model, views)
     if len(used) < LEAST_POSES:
         raise BadInput(
@@ -86,7 +109,7 @@ def calibrate_hand_eye(
     moved = base_from_tool[used] if mounting == "eye-to-hand" else inverse_poses(base_from_tool[used])
     missing = missing_motion(moved)
     start = best_start(camera_from_board, moved)
-    observations = _Observations(model, [views[k] for k in used], moved, mounting)
+    observations = _Observations(model, [views[k] for k in used], moved, mounting, lens)
     solved = _refine(observations, start, arm)
     hold_out = _hold_out(observations, (solved.camera_from_mount, solved.held_from_board), arm)
     findings = [Finding("refused", text) for text in missing] + _judge(solved, hold_out, len(used))
@@ -252,9 +275,10 @@ class _Observations:
     views: Sequence[TargetView]
     moved: Float[Array, "n 4 4"]
     mounting: Mounting
+    lens: LensAccuracy
 
     def some(self, keep: Array) -> _Observations:
-        return _Observations(self.model, [v for v, k in zip(self.views, keep) if k], self.moved[keep], self.mounting)
+        return replace(self, views=[v for v, k in zip(self.views, keep) if k], moved=self.moved[keep])
 
     def corrected(self, off: Float[Array, "n 6"]) -> Float[Array, "n 4 4"]:
         """The arm errs in its tool's frame, which is on the right of base_from_tool and on the left of its inverse."""
@@ -295,10 +319,10 @@ def _solve(observations: _Observations, start: tuple[Array, Array], arm: ArmAccu
         X = exp_poses(numbers[None, :6])[0] @ start[0]
         return X, exp_poses(numbers[None, 6:12])[0] @ start[1], numbers[12:].reshape(count, 6) * sigma
 
-    def gaps(numbers: Array) -> Array:
+    def gaps(numbers: Array, model: CameraModel = observations.model) -> Array:
         X, T, off = split(numbers)
         chain = (X[None] @ observations.corrected(off) @ T[None])[owner]
-        seen = observations.model.project(np.einsum("nij,nj->ni", chain[:, :3, :3], points) + chain[:, :3, 3])
+        seen = model.project(np.einsum("nij,nj->ni", chain[:, :3, :3], points) + chain[:, :3, 3])
         return np.where(np.isfinite(seen), seen - pixels, 1e3)
 
     def residuals(numbers: Array) -> Array:
@@ -307,10 +331,20 @@ def _solve(observations: _Observations, start: tuple[Array, Array], arm: ArmAccu
     numbers, J, left = _gauss_newton(residuals, np.zeros(12 + 6 * count), owner)
     X, T, off = split(numbers)
     scale = max(1.0, float(left @ left) / max(1, len(left) - len(numbers)))
-    covariance = scale * np.linalg.pinv(J.T @ J, hermitian=True)[:6, :6]
+    inverse = np.linalg.pinv(J.T @ J, hermitian=True)
+    covariance, weight = scale * inverse[:6, :6], _root_weights(residuals(numbers))
+    for other in observations.lens.others(observations.model):
+        change = np.einsum("nij,nj->ni", white, gaps(numbers, other) - gaps(numbers)).ravel()
+        moved = -(inverse @ J.T @ (weight * np.append(change, np.zeros(6 * count))))[:6]
+        covariance += np.outer(moved, moved)
     turns, shifts = np.linalg.norm(off[:, :3], axis=1), np.linalg.norm(off[:, 3:], axis=1)
     robot_deg, robot_mm = (float(np.sqrt((v**2).mean())) for v in (np.degrees(turns), 1e3 * shifts))
     return _Refined(X, T, covariance, -gaps(numbers), robot_deg, robot_mm)
+
+
+def _root_weights(residuals: Array) -> Array:
+    """Roots of Huber's weights."""
+    return np.sqrt(huber_weight(np.abs(residuals), HUBER))
 
 
 def _gauss_newton(residuals: Callable[[Array], Array], numbers: Array, owner: Array) -> tuple[Array, Array, Array]:
@@ -320,7 +354,7 @@ def _gauss_newton(residuals: Callable[[Array], Array], numbers: Array, owner: Ar
     trial = numbers
     for _ in range(STEPS):
         plain = residuals(trial)
-        weight = np.sqrt(huber_weight(np.abs(plain), HUBER))
+        weight = _root_weights(plain)
         cost = 2 * float(huber_cost(np.abs(plain), HUBER).sum())
         if cost < best:
             gain, best, numbers, damping = best - cost, cost, trial, max(damping / 10, 1e-9)

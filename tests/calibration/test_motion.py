@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
 
+from calibration.cameras.intrinsics import calibrate_intrinsics
 from calibration.cameras.poses import angle_deg, exp_poses, inverse_poses, log_poses
 from calibration.cameras.targets import Tags
 from calibration.ground_plane import (
@@ -17,7 +19,7 @@ from calibration.ground_plane import (
     place_world,
     table_points,
 )
-from calibration.hand_eye import best_start, calibrate_hand_eye, daniilidis, missing_motion, park
+from calibration.hand_eye import LensAccuracy, best_start, calibrate_hand_eye, daniilidis, missing_motion, park
 from calibration.time_offset import (
     Path3,
     TimeOffset,
@@ -82,6 +84,27 @@ def test_an_arm_much_worse_than_assumed_widens_the_deviation_until_it_holds(geom
     assert said["position_mm"] > 2.0
     assert mm < 2.5 * said["position_mm"]
     assert deg < 2.5 * said["direction_deg"]
+
+
+def squared_deviations(found, true):
+    """Of place and direction in standard deviations: chi-square of 3 degrees of freedom where these are right."""
+    gap = log_poses((true @ inverse_poses(found.camera_from_mount))[None])[0]
+    return [float(gap[k] @ np.linalg.solve(found.covariance[k, k], gap[k])) for k in (slice(3, 6), slice(0, 3))]
+
+
+def test_the_interval_holds_the_camera_where_its_lens_was_fitted_on_few_noisy_corners(geometry):
+    held = {"lens as exact": 0, "lens as stated": 0}
+    for seed in range(4):
+        mounting = ("eye-to-hand", "eye-in-hand")[seed % 2]
+        model, mount, _, robot, views = arm_case(geometry, seed, mounting)
+        rng = np.random.default_rng(100 + seed)
+        board = [geometry.view(model, geometry.tilted(rng, tilt_deg=25.0), rng, sigma_px=0.5) for _ in range(8)]
+        lens = calibrate_intrinsics("d455", (848, 480), board, ("none",))
+        for name, sure in zip(held, (LensAccuracy(), LensAccuracy.stated(lens.report.uncertainty))):
+            found = calibrate_hand_eye(lens.model, views, robot, mounting, lens=sure)
+            held[name] += max(squared_deviations(found, mount)) < chi2.ppf(0.99, 3)
+    assert held["lens as stated"] == 4
+    assert held["lens as exact"] <= 1
 
 
 def test_park_and_daniilidis_are_exact_without_noise(geometry):
