@@ -80,6 +80,7 @@ class UrServer(Faulty):
                 "safety": body.safety.name,
                 "script_running": body.script_running,
                 "moves": body.moves,
+                "payload": list(body.payload),
                 "ticks": self._ticks,
                 "stretched_s": self._stretched_s,
                 **self._counts,

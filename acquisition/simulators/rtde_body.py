@@ -18,6 +18,7 @@ TICK_S = 2e-3
 READY_RAD = (0.0, -1.5708, 1.5708, -1.5708, -1.5708, 0.0)
 DQ_MAX_RAD_S = np.pi
 BRAKE_RAD_S2 = 10.0
+MOST_PAYLOAD_KG = 5.0
 
 
 class UrBody:
@@ -32,6 +33,8 @@ class UrBody:
         self.script_running = False
         self.answer = 0
         self.moves = 0
+        self.payload = [0.0] * 4
+        """Mass (kg) and centre of mass (m, in the flange's frame)."""
         self._command = 0
         self._servo: tuple[Float[Array, "6"], float] | None = None
         self._move: _Move | None = None
@@ -89,7 +92,11 @@ class UrBody:
             self._move.reported = registers.get("input_int_register_1", 0) == 1  # asynchronous: done is told at once
             self.answer = wire.DONE if self._move.reported else 0
             self.moves += 1
+        elif command == wire.Command.SET_PAYLOAD and not 0 <= numbers[0] <= MOST_PAYLOAD_KG:
+            self.end_script()  # set_payload raises, which ends the program
         else:
+            if command == wire.Command.SET_PAYLOAD:
+                self.payload = numbers[:4]
             if command in (wire.Command.SERVO_STOP, wire.Command.STOP_J):
                 self._servo = self._move = None
             self.answer = wire.DONE

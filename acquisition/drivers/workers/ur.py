@@ -72,9 +72,21 @@ class ArmLoop:
                 self.follower.brake()
         elif message["do"] == "recover":
             self._end.event("answer", reason=self._recover())
+        elif message["do"] == "load":
+            self._end.event("answer", reason=self._load(message["mass"], message["centre"]))
         elif message["do"] == "check":
             self._end.event("answer", reason=self._unfit())
         return message["do"] != "quit"
+
+    def _load(self, mass_kg: float, centre_flange_m: list[float]) -> str:
+        """`set_payload` of the control script; a controller that does not take it ends the script."""
+        if self.follower is not None:
+            return "a motion is under way"
+        try:
+            taken = self._control.setPayload(mass_kg, centre_flange_m) and self._control.isProgramRunning()
+        except RuntimeError as error:
+            return str(error)
+        return "" if taken else self._stop_reason() or "its controller refuses set_payload: more than it carries?"
 
     def _unfit(self) -> str:
         """What the dashboard says against a motion: the safety mode, the panel's control."""
