@@ -29,6 +29,8 @@ SAMPLES = 300
 REACH_RAD = 0.6
 """The sampled tree grows by steps of this length at most."""
 SHORTCUTS = 40
+STANDING_RAD, STAND_S = 1e-6, 0.1
+"""Where the arm is at its goal already, the motion is to stand there for this long."""
 Pose = Float[Array, " j"]
 
 
@@ -182,6 +184,8 @@ def _shortened(model: ArmModel, space: Space, way: list[Pose]) -> list[Pose]:
 
 def _leg(model: ArmModel, a: Pose, b: Pose) -> Samples:
     still = np.zeros(model.joints)
+    if np.abs(b - a).max() < STANDING_RAD:
+        return Samples(np.array([0.0, STAND_S]), np.stack([a, b]), np.stack([still, still]), np.stack([still, still]))
     part = limited_motion(model, (a, still), (b, still), SHARE_OF_SPEED, GENTLE)
     if part is None:
         raise PathRefused(f"no motion of the {model.name} to the start of the toss; move it there by hand")

@@ -71,8 +71,9 @@ class UrArm(WorkerArm):
         return "its controller did not say whether it may move; check the network" if answer is None else answer
 
     def set_load(self, mass_kg: float, centre_flange_m: Float[Array, "3"], radius_m: float) -> None:
-        """What the hand holds, for the controller's model of the arm; it asks for no inertia, so `radius_m` is not
-        said. Raises DeviceRefused where the controller does not take it, and during a motion."""
+        """What the hand holds, added to the payload that the controller had when the arm was opened (the gripper's, set
+        at the panel). It asks for no inertia, so `radius_m` is not said. Raises DeviceRefused where the controller does
+        not take it, and during a motion."""
         answer = self.ask_worker({"do": "load", "mass": mass_kg, "centre": centre_flange_m.tolist()})
         if answer != "":
             raise DeviceRefused(f"{self.name}: the load of {mass_kg:g} kg was not taken: {answer or 'no answer'}")

@@ -19,6 +19,8 @@ READY_RAD = (0.0, -1.5708, 1.5708, -1.5708, -1.5708, 0.0)
 DQ_MAX_RAD_S = np.pi
 BRAKE_RAD_S2 = 10.0
 MOST_PAYLOAD_KG = 5.0
+GRIPPER = (1.0, 0.0, 0.0, 0.06)
+"""The payload that was set at the panel: mass (kg) and centre of mass (m, in the flange's frame)."""
 
 
 class UrBody:
@@ -33,8 +35,7 @@ class UrBody:
         self.script_running = False
         self.answer = 0
         self.moves = 0
-        self.payload = [0.0] * 4
-        """Mass (kg) and centre of mass (m, in the flange's frame)."""
+        self.payload = list(GRIPPER)
         self._command = 0
         self._servo: tuple[Float[Array, "6"], float] | None = None
         self._move: _Move | None = None

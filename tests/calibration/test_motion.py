@@ -19,7 +19,8 @@ from calibration.ground_plane import (
     place_world,
     table_points,
 )
-from calibration.hand_eye import LensAccuracy, best_start, calibrate_hand_eye, daniilidis, missing_motion, park
+from calibration.hand_eye import LensAccuracy, calibrate_hand_eye, missing_motion
+from calibration.hand_eye_start import best_start, daniilidis, park
 from calibration.time_offset import (
     Path3,
     TimeOffset,
