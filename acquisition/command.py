@@ -57,9 +57,9 @@ def run(args: argparse.Namespace) -> Outcome:
     with Interrupts() as interrupts, single_keys(sys.stdin):
         report, checks, live = _record(args, setup, out, operator, interrupts)
     if setup.lab is not None and report.takes:
-        from acquisition.synthetic.truth_sidecar import write_beside
+        from acquisition.synthetic.truth_sidecar import write_sidecar
 
-        write_beside(setup.lab, out)
+        write_sidecar(setup.lab, out)
     if live is None:
         return outcome(report, checks)
     live.wait()

@@ -1,6 +1,6 @@
 """A toss, watched while it happens: release, first impact, rest, from the gripper's width and thumbnails of depth.
 
-Everything above the table that is not the arm is the object. In flight its middle follows a parabola; where it leaves
+Everything above the table that is not the arm is the object. In flight its centroid follows a parabola; where it leaves
 it, the object has hit something. Live, the watcher only has to know when the toss is over; the events are worked out
 from all that was seen, once it is.
 """
@@ -44,10 +44,10 @@ LONGEST_FLIGHT_S = 1.5
 
 @dataclass(frozen=True, eq=False)
 class Glimpse:
-    """The object in one thumbnail: middle, lowest point (world), how many points."""
+    """The object in one thumbnail: centroid, lowest point (world), how many points."""
 
     time_s: float
-    middle_m: Float[Array, "3"]
+    centroid_m: Float[Array, "3"]
     lowest_m: float
     points: int
 
@@ -193,9 +193,9 @@ class TossWatcher:
             return None
         last = self.glimpses[-1]
         if len(self.glimpses) < 2 or time_s - last.time_s > 0.1:
-            return last.middle_m
+            return last.centroid_m
         before = self.glimpses[-2]
-        return last.middle_m + (last.middle_m - before.middle_m) * (time_s - last.time_s) / (
+        return last.centroid_m + (last.centroid_m - before.centroid_m) * (time_s - last.time_s) / (
             last.time_s - before.time_s
         )
 
@@ -272,7 +272,7 @@ def _longest_flight(glimpses: Sequence[Glimpse]) -> tuple[int, int] | None:
     if len(glimpses) < FEWEST_FALLING:
         return None
     t = np.array([g.time_s for g in glimpses])
-    p = np.array([g.middle_m for g in glimpses])
+    p = np.array([g.centroid_m for g in glimpses])
     best: tuple[int, int] | None = None
     for first in range(len(t) - FEWEST_FALLING + 1):
         last = first + FEWEST_FALLING - 1
@@ -286,7 +286,7 @@ def _longest_flight(glimpses: Sequence[Glimpse]) -> tuple[int, int] | None:
 
 
 def _falls(t: Float[Array, " n"], p: Float[Array, "n 3"]) -> bool:
-    """Whether a course is a parabola of free fall: its residual is small, and a resting thing's is not."""
+    """Whether a trajectory is a parabola of free fall: its residual is small, and a resting thing's is not."""
     s = t - t[0]
     free = p + np.outer(s**2, [0, 0, GRAVITY_M_S2 / 2])
     design = np.stack([np.ones_like(s), s], 1)
@@ -296,10 +296,10 @@ def _falls(t: Float[Array, " n"], p: Float[Array, "n 3"]) -> bool:
 
 
 def still_since_s(glimpses: Sequence[Glimpse]) -> float | None:
-    """When the object stopped for good: from there on its middle stays where it is at the end, but for noise."""
+    """When the object stopped for good: from there on its centroid stays where it is at the end, but for noise."""
     if len(glimpses) < 6:
         return None
-    p = np.array([g.middle_m for g in glimpses])
+    p = np.array([g.centroid_m for g in glimpses])
     end = np.median(p[-6:], axis=0)
     noise_m = float(np.median(np.linalg.norm(p[-6:] - end, axis=1)))
     away = np.linalg.norm(p - end, axis=1) > np.clip(3.5 * noise_m, 2 * STILL_M, 5 * STILL_M)
@@ -332,13 +332,13 @@ def _flight_after(glimpses: Sequence[Glimpse], released: Moment | None) -> tuple
     if len(after) < 4:
         return None
     t = np.array([glimpses[i].time_s for i in after])
-    p = np.array([glimpses[i].middle_m for i in after])
+    p = np.array([glimpses[i].centroid_m for i in after])
     for count in range(4, len(after)):
         s = t[:count] - t[0]
         fall = p[:count, 2] + GRAVITY_M_S2 / 2 * s**2
-        course = np.polyfit(s, fall, 1)
+        trend = np.polyfit(s, fall, 1)
         ahead = t[count] - t[0]
-        predicted = np.polyval(course, ahead) - GRAVITY_M_S2 / 2 * ahead**2
+        predicted = np.polyval(trend, ahead) - GRAVITY_M_S2 / 2 * ahead**2
         if p[count, 2] - predicted > LEFT_PARABOLA_M:
             return after[0], after[count - 1]
     return after[0], after[-1]

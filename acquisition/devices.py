@@ -306,7 +306,7 @@ class Arm(Device, Protocol):
 
 @runtime_checkable
 class TakesLoad(Protocol):
-    """An arm that is told what its hand holds. Others are told at their panel."""
+    """An arm that is told what its hand holds."""
 
     def set_load(self, mass_kg: float, centre_flange_m: Float[Array, "3"], radius_m: float) -> None:
         """A full ball of this mass about a point in the flange's frame; mass 0: nothing. Not during a motion."""

@@ -11,23 +11,22 @@ import importlib.util
 import os
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import IO, Protocol, runtime_checkable
 
 from acquisition.devices import Image
 from acquisition.operator import Operator
 from acquisition.streaming.recorder import DepthThumbnail
+from acquisition.streaming.side_thread import SideThread
 from recordings.errors import BadInput
 from recordings.live_frames import FrameBoardWriter, LiveFrame, memory_folder
 from recordings.results.live import LineReader, live_folder, read_state
 
 POLL_S, FEED_S = 0.2, 0.002
 CAMERA = "d455"
-FAR_APART_NS = 20_000_000
+MOST_GAP_NS = 20_000_000
 FOLLOWER, VIEWER = "processing.cli", "recordings.cli_view"
 NO_DISPLAY = "live: there is no display here; elsewhere on this machine: toss-view --live {session}"
 
@@ -58,8 +57,6 @@ class LiveSession:
 
     def __init__(self, session: Path, operator: Operator, recorder: Records, pose: bool = False) -> None:
         self._session, self._operator, self._recorder, self._pose = session, operator, recorder, pose
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._listen, name="live", daemon=True)
         self._follower: subprocess.Popen[bytes] | None = None
         self._viewer: subprocess.Popen[bytes] | None = None
         self._open = contextlib.ExitStack()
@@ -82,14 +79,10 @@ class LiveSession:
                     self._operator.say(NO_DISPLAY.format(session=self._session))
         except OSError as refused:
             self._operator.say(f"live: it cannot be started ({refused}); recording goes on without it")
-        self._thread.start()
+        self._open.enter_context(SideThread("live", POLL_S, self._listen))
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._stop.set()
-        self._thread.join(2.0)
+    def __exit__(self, *_: object) -> None:
         self._open.close()
 
     def wait(self) -> bool:
@@ -116,10 +109,9 @@ class LiveSession:
         return {"state": None if state is None else state.state, "exit_code": code}
 
     def _listen(self) -> None:
-        while not self._stop.wait(POLL_S):
-            if self._recorder.take is None:
-                self._say_lines()
-                self._say_end()
+        if self._recorder.take is None:
+            self._say_lines()
+            self._say_end()
 
     def _say_lines(self) -> None:
         for line in self._lines.new():
@@ -141,28 +133,22 @@ class FrameFeed:
     def __init__(self, recorder: Records) -> None:
         self._recorder = recorder
         self.path = memory_folder() / f"toss-record-{os.getpid()}-frames"
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="live frames", daemon=True)
+        self._shown, self._open = -1, contextlib.ExitStack()
 
     def __enter__(self) -> FrameFeed:
-        self._thread.start()
+        self._board = self._open.enter_context(FrameBoardWriter(self.path))
+        self._open.enter_context(SideThread("live frames", FEED_S, self._feed))
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._stop.set()
-        self._thread.join(2.0)
+    def __exit__(self, *_: object) -> None:
+        self._open.close()
 
-    def _run(self) -> None:
-        shown = -1
-        with FrameBoardWriter(self.path) as board:
-            while not self._stop.wait(FEED_S):
-                frame = newest_frame(self._recorder)
-                if frame is not None and frame.number != shown:
-                    shown = frame.number
-                    with contextlib.suppress(BadInput):  # another size in mid-session: the recorder tells of that
-                        board.put(frame)
+    def _feed(self) -> None:
+        frame = newest_frame(self._recorder)
+        if frame is not None and frame.number != self._shown:
+            self._shown = frame.number
+            with contextlib.suppress(BadInput):  # another size in mid-session: the recorder tells of that
+                self._board.put(frame)
 
 
 def newest_frame(recorder: Records) -> LiveFrame | None:
@@ -172,12 +158,12 @@ def newest_frame(recorder: Records) -> LiveFrame | None:
     if color is None or depth is None or not thumbnails or thumbnails[-1].number != depth.number:
         return None
     depth_ns = thumbnails[-1].time_ns
-    apart_ns = color.mid_exposure_ns - depth.mid_exposure_ns
-    if abs(apart_ns) > FAR_APART_NS:  # of two frames, one of which is not there yet
+    gap_ns = color.mid_exposure_ns - depth.mid_exposure_ns
+    if abs(gap_ns) > MOST_GAP_NS:  # of two frames, one of which is not there yet
         return None
     host_ns = max(color.host_ns, depth.host_ns)
     return LiveFrame(
-        color.number, depth_ns + apart_ns, depth_ns, host_ns, color.pixels, depth.pixels, thumbnails[-1].unit_m
+        color.number, depth_ns + gap_ns, depth_ns, host_ns, color.pixels, depth.pixels, thumbnails[-1].unit_m
     )
 
 

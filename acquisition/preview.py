@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import threading
-from types import TracebackType
+import contextlib
 from typing import Any
 
 from acquisition.streaming.recorder import Recorder
+from acquisition.streaming.side_thread import SideThread
 
 EVERY_S = 0.2
 WIDEST_PX = 480
@@ -20,35 +20,26 @@ class Preview:
 
         self._recorder = recorder
         self.view = LiveView(headless)
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="preview", daemon=True)
+        self._shown: dict[str, int] = {}
+        self._thread = SideThread("preview", EVERY_S, self.show)
+        self._open = contextlib.ExitStack()
 
     def __enter__(self) -> Preview:
-        self.view.__enter__()
-        self._thread.start()
+        self._open.enter_context(self.view)
+        self._open.enter_context(self._thread)
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._stop.set()
-        self._thread.join(2.0)
-        self.view.__exit__(kind, error, trace)
+    def __exit__(self, *_: object) -> None:
+        self._open.close()
 
     def picture(self) -> bytes:
         """A PNG of the viewer's window; what is shown stays as it is from here on."""
-        self._stop.set()
-        self._thread.join(2.0)
+        self._thread.stop()
         return self.view.picture()
 
-    def _run(self) -> None:
-        shown: dict[str, int] = {}
-        while not self._stop.wait(EVERY_S):
-            self.show(shown)
-
-    def show(self, shown: dict[str, int]) -> None:
+    def show(self) -> None:
         """Everything that is new since the last time."""
-        recorder = self._recorder
+        recorder, shown = self._recorder, self._shown
         for topic, image in list(recorder.latest.items()):
             if shown.get(topic) == image.number:
                 continue

@@ -11,6 +11,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
+from recordings.bounded.limits import MOST_CONFIG_BYTES, read_bytes
 from recordings.errors import BadInput
 
 Kind = Literal["rgbd", "mono", "arm", "gripper"]
@@ -175,8 +176,10 @@ def shipped_rigs() -> list[str]:
 def read_rig(path: Path) -> Rig:
     """Read and check a rig file. Raises BadInput naming the key, the device or the rate."""
     try:
-        table = tomllib.loads(path.read_text())
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as wrong:
+        table = tomllib.loads(read_bytes(path, MOST_CONFIG_BYTES, "a rig file").decode())
+    except RecursionError as wrong:
+        raise BadInput(f"{path}: cannot be read as a rig file (its lists are nested without end)") from wrong
+    except (OSError, ValueError) as wrong:
         raise BadInput(f"{path}: cannot be read as a rig file ({wrong})") from wrong
     named = table.pop("devices", {})
     if not isinstance(named, dict) or not all(isinstance(d, dict) for d in named.values()):

@@ -188,7 +188,7 @@ class SessionRun:
         ended_by: str,
     ) -> tuple[Verdict, str]:
         try:
-            self._write_story(writer, take, events, troubles, verdict)
+            self._write_events(writer, take, events, troubles, verdict)
             writer.finish()
             info = self._info(verdict, take, ended_by)
             self.session.add_info(toss, info)
@@ -221,11 +221,11 @@ class SessionRun:
         """Wait for the queues; stays answerable to Ctrl-C, and says so when the disk keeps everybody waiting."""
         self.recorder.end()
         self._ended_host_ns = time.monotonic_ns()
-        tell = time.monotonic() + SLOW_S
+        next_warning_s = time.monotonic() + SLOW_S
         while not self.recorder.ended():
-            if time.monotonic() > tell:
+            if time.monotonic() > next_warning_s:
                 self.operator.say("the disk is slow: still writing what was recorded")
-                tell += SLOW_S
+                next_warning_s += SLOW_S
             time.sleep(POLL_S)
 
     def _counts(self, before: Mapping[str, Tally]) -> dict[str, Tally]:
@@ -239,7 +239,7 @@ class SessionRun:
             if tally.dropped_total:
                 writer.dropped(topic, tally.dropped_total)
 
-    def _write_story(
+    def _write_events(
         self, writer: TossWriter, take: WatchedTake, events: TossEvents, troubles: Sequence[Trouble], verdict: Verdict
     ) -> None:
         """The command, the events, the health lines and the verdict, into the toss's file."""
@@ -260,8 +260,8 @@ class SessionRun:
             "warnings": list(verdict.warnings),
             "ended_by": ended_by,
             "clocks": self.recorder.clocks(),
-            "gripper": take.gripper_story(),
-            "motion": take.motion_story(),
+            "gripper": take.gripper_summary(),
+            "motion": take.motion_summary(),
             "fullest_queues": {topic: queue.fullest for topic, queue in self.recorder.queues.items()},
         }
 

@@ -183,21 +183,21 @@ class WatchedTake:
             self._plan.angular_velocity_world_rad_s,
         )
 
-    def gripper_story(self) -> dict[str, Any]:
+    def gripper_summary(self) -> dict[str, Any]:
         """Command sent, acknowledged, first movement: the release delay of this toss."""
         if self._throw is None or self._throw.sent_host_ns is None:
             return {}
         clock, command = self._run.recorder.clock, self._throw.command()
         sent_ns = clock.session_ns(self._throw.sent_host_ns)
-        story: dict[str, Any] = {"sent_session_ns": sent_ns}
+        summary: dict[str, Any] = {"sent_session_ns": sent_ns}
         if command is not None and command.acknowledged_host_ns is not None:
-            story["acknowledged_session_ns"] = clock.session_ns(command.acknowledged_host_ns)
+            summary["acknowledged_session_ns"] = clock.session_ns(command.acknowledged_host_ns)
         released = self.watcher.released
         if released is not None:
-            story["release_delay_s"] = released.time_s - sent_ns / 1e9
-        return story
+            summary["release_delay_s"] = released.time_s - sent_ns / 1e9
+        return summary
 
-    def motion_story(self) -> dict[str, Any]:
+    def motion_summary(self) -> dict[str, Any]:
         if self._throw is None:
             return {}
         motion = self._throw.motion()

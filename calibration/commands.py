@@ -17,7 +17,7 @@ from calibration.cameras.intrinsics import Lens, as_good_alone, calibrate_intrin
 from calibration.cameras.targets import Tags, TargetView
 from calibration.done import TOOL, Done, done
 from calibration.drift import bumps
-from calibration.hand_eye import calibrate_hand_eye
+from calibration.hand_eye import LensAccuracy, calibrate_hand_eye
 from calibration.pictures import residual_picture
 from calibration.report import Finding
 from calibration.tags.faults import explain_absence
@@ -31,6 +31,7 @@ from calibration.views import (
     read_board_views,
     table_target,
 )
+from recordings.bounded.documents import as_dict
 from recordings.errors import BadInput
 from recordings.geometry import DistortionModel, Transform
 from recordings.progress import Progress
@@ -204,7 +205,9 @@ def hand_eye(path: Path, args: argparse.Namespace, progress: Progress) -> Done:
         base_from_tool, kept = _robot_poses(session, views)
         board_views = [views.board[args.camera][k] for k in kept]
         model = session.calibration.camera(args.camera)
-        solved = calibrate_hand_eye(model, board_views, base_from_tool, args.mounting)
+        lens = as_dict(as_dict(session.calibration.residuals.get("intrinsics")).get(args.camera))
+        accuracy = LensAccuracy.stated(as_dict(lens.get("uncertainty")))
+        solved = calibrate_hand_eye(model, board_views, base_from_tool, args.mounting, lens=accuracy)
         picture = residual_picture(
             store.work_folder(session) / "hand_eye.png",
             f"{session.name}: {solved.report.kind}",

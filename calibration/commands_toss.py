@@ -113,7 +113,7 @@ def _mono_offset(session: Session, solved: SolvedToss) -> TimeOffset:
     body = Tags(session.calibration.tag_family, solved.size_m, solved.body.body_from_tag)
     stamps = solved.tags.times_ns[COLOR] / 1e9
     frames = [(float(t), tag_view(body, tags)) for t, tags in zip(stamps, solved.tags.tags[COLOR])]
-    found = offset_of_corners(solved.course, session.calibration.camera(COLOR), np.eye(4), frames)
+    found = offset_of_corners(solved.trajectory, session.calibration.camera(COLOR), np.eye(4), frames)
     return replace(found, offset_s=-found.offset_s)
 
 
@@ -127,12 +127,12 @@ def _arm_offset(session: Session, toss: Toss, solved: SolvedToss, mono: TimeOffs
     release = toss.window().release_time_ns or _fingers_open_ns(states.time_ns, states.finger_width_m)
     times = np.arange(states.time_ns[0], min(states.time_ns[-1], release), ARM_STEP_NS)
     tool = np.array([arm_path.links(int(t))[TOOL].matrix for t in times])
-    held = solved.course.time_s + mono.offset_s < release / 1e9
+    held = solved.trajectory.time_s + mono.offset_s < release / 1e9
     if held.sum() < 4:
         raise BadInput(f"the object is seen in {int(held.sum())} images before the release; wanted 4")
     other = Path3(
-        solved.course.time_s[held] + mono.offset_s,
-        base.points(solved.course.position_m[held]),
+        solved.trajectory.time_s[held] + mono.offset_s,
+        base.points(solved.trajectory.position_m[held]),
     )
     found = offset_of_paths(Path3.of_poses(times / 1e9, tool), other)
     std = float(np.hypot(found.std_s, mono.std_s))
@@ -159,9 +159,9 @@ def cameras_from_object(path: Path, args: argparse.Namespace, progress: Progress
         tags = read_toss_tags(session, number, store.work_folder(session), progress, refinement="pattern")
         cameras = mono_cameras(session, list(tags.tags))
         of_object = tags.of_object(tag_ids(args), table_target(session.calibration))
-        sightings, times_ns = triggered(tags, of_object, cameras)
+        detections, times_ns = triggered(tags, of_object, cameras)
         models = {c: session.calibration.cameras[c] for c in cameras}
-        solved = solve_tagged_object(models, sightings, tag_sizes(args, of_object, {}), None)
+        solved = solve_tagged_object(models, detections, tag_sizes(args, of_object, {}), None)
         places = solved.solved.scene.camera_from_rig
         rig = solved.cameras[0]
         transforms = [

@@ -43,7 +43,7 @@ GRAVITY_DEG = 1.0
 LEAST_FLIGHT = 7
 FLIGHT_RMS_M = 0.0012
 CENTER_SIGMA_M = 0.01
-"""Of the centre of mass about the middle of the tags."""
+"""Of the centre of mass about the centre of the tags."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,29 +2,29 @@
 
 Eye-to-hand: a board point p is seen by the fixed camera at C B_i T p, with B_i = base_from_tool of pose i,
 C = camera_from_base and T = tool_from_board. Eye-in-hand: C B_i^-1 T p with C = camera_from_tool, T = base_from_board.
-Both are A_i X = Y B_i for the board's pose A_i in the camera. Start: Park and Martin (1994) and Daniilidis (1999) on
-the relative motions; then the reprojection errors and the robot's own errors are minimised together, each robot pose
+Both are A_i X = Y B_i for the board's pose A_i in the camera. The start (`hand_eye_start.py`) is of the
+relative motions; then the reprojection errors and the robot's own errors are minimised together, each robot pose
 being free within what the arm is known for.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from typing import Literal
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray as Array
-from scipy.linalg import sqrtm
 from scipy.spatial.transform import Rotation
 
 from calibration.cameras.extrinsics import LEAST_POINTS, board_pose, whitening
-from calibration.cameras.poses import angle_deg, exp_poses, inverse_poses, log_poses
+from calibration.cameras.poses import angle_deg, exp_poses, inverse_poses
 from calibration.cameras.targets import TargetView
+from calibration.hand_eye_start import best_start
 from calibration.report import Finding, Report, limit
 from recordings.errors import BadInput
-from recordings.geometry import CameraModel, skew
+from recordings.geometry import CameraModel
 from recordings.robust import huber_cost, huber_weight
 
 Mounting = Literal["eye-to-hand", "eye-in-hand"]
@@ -38,7 +38,7 @@ GOOD_PX, WORST_PX = 0.5, 3.0
 FOLDS = 4
 HUBER = 2.5
 STEPS = 30
-ROUNDS, GROWS = 6, 1.05
+ROUNDS, CONVERGED_RATIO = 6, 1.05
 DIFFERENCE, POSE_DIFFERENCE = 1e-7, 1e-4
 
 
@@ -48,6 +48,27 @@ class ArmAccuracy:
 
     turn_deg: float = 0.05
     shift_m: float = 0.0003
+
+
+@dataclass(frozen=True)
+class LensAccuracy:
+    """Standard deviations of a lens, as `toss-calibrate intrinsics` states them; 0 where nothing is stated."""
+
+    focal_percent: float = 0.0
+    principal_point_px: float = 0.0
+
+    @staticmethod
+    def stated(uncertainty: Mapping[str, Any]) -> LensAccuracy:
+        """From a report of intrinsics."""
+        return LensAccuracy(*(float(uncertainty.get(f.name) or 0.0) for f in fields(LensAccuracy)))
+
+    def others(self, model: CameraModel) -> list[CameraModel]:
+        """Lenses one standard deviation off: in both focal lengths, and in each axis of the principal point."""
+        longer = 1 + self.focal_percent / 100
+        side_px = self.principal_point_px / np.sqrt(2)
+        changes = [np.diag([model.fx, model.fy, 0.0]) * (longer - 1), *(np.zeros((3, 3)) for _ in range(2))]
+        changes[1][0, 2] = changes[2][1, 2] = side_px
+        return [replace(model, K=model.K + change) for change in changes if change.any()]
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,13 +91,15 @@ def calibrate_hand_eye(
     base_from_tool: Float[Array, "n 4 4"],
     mounting: Mounting,
     arm: ArmAccuracy | None = None,
+    lens: LensAccuracy | None = None,
 ) -> HandEye:
-    """From one view of the board per robot pose. Views without the board are left out.
+    """From one view of the board per robot pose. Views without the board are left out. The lens is kept as given; how
+    far another one within its accuracy would move the camera counts into the covariance.
 
     Raises BadInput where too few views show it. Too little rotation is a refusal in the report, with the motion that is
     missing.
     """
-    arm = arm or ArmAccuracy()
+    arm, lens = arm or ArmAccuracy(), lens or LensAccuracy()
     camera_from_board, used = _board_poses(model, views)
     if len(used) < LEAST_POSES:
         raise BadInput(
@@ -86,7 +109,7 @@ def calibrate_hand_eye(
     moved = base_from_tool[used] if mounting == "eye-to-hand" else inverse_poses(base_from_tool[used])
     missing = missing_motion(moved)
     start = best_start(camera_from_board, moved)
-    observations = _Observations(model, [views[k] for k in used], moved, mounting)
+    observations = _Observations(model, [views[k] for k in used], moved, mounting, lens)
     solved = _refine(observations, start, arm)
     hold_out = _hold_out(observations, (solved.camera_from_mount, solved.held_from_board), arm)
     findings = [Finding("refused", text) for text in missing] + _judge(solved, hold_out, len(used))
@@ -118,7 +141,7 @@ def missing_motion(moved: Float[Array, "n 4 4"]) -> list[str]:
             f"the robot turned by {span:.0f} deg at most between poses, wanted {LEAST_TURN_DEG:.0f} or more (45 is "
             "good): turn the tool about two different axes, for instance roll +-30 deg and pitch +-30 deg"
         ]
-    vectors = _relative_turns(moved)
+    vectors = _relative_rotations(moved)
     values, axes = np.linalg.eigh(vectors.T @ vectors)
     if np.sqrt(values[1] / values[2]) < LEAST_SECOND_AXIS:
         axis = axes[:, 2]
@@ -131,103 +154,20 @@ def missing_motion(moved: Float[Array, "n 4 4"]) -> list[str]:
     return []
 
 
-def _relative_turns(moved: Float[Array, "n 4 4"]) -> Float[Array, "m 3"]:
+def _relative_rotations(moved: Float[Array, "n 4 4"]) -> Float[Array, "m 3"]:
     first, second = np.triu_indices(len(moved), 1)
     turns = np.swapaxes(moved[first, :3, :3], 1, 2) @ moved[second, :3, :3]
     return Rotation.from_matrix(turns).as_rotvec()
 
 
 def _span_deg(moved: Float[Array, "n 4 4"]) -> float:
-    return float(np.degrees(np.linalg.norm(_relative_turns(moved), axis=1).max(initial=0.0)))
+    return float(np.degrees(np.linalg.norm(_relative_rotations(moved), axis=1).max(initial=0.0)))
 
 
 def _board_poses(model: CameraModel, views: Sequence[TargetView]) -> tuple[Float[Array, "n 4 4"], list[int]]:
     found = {k: board_pose(model, view) for k, view in enumerate(views) if len(view) >= LEAST_POINTS}
     used = [k for k, candidates in found.items() if candidates]
     return np.array([found[k][0] for k in used]).reshape(-1, 4, 4), used
-
-
-def best_start(camera_from_board: Float[Array, "n 4 4"], moved: Float[Array, "n 4 4"]) -> tuple[Array, Array]:
-    """(camera_from_mount, held_from_board) by Park and by Daniilidis, whichever leaves less."""
-    starts = [park(camera_from_board, moved), daniilidis(camera_from_board, moved)]
-    return min(starts, key=lambda s: _misfit(camera_from_board, moved, *s))
-
-
-def _misfit(A: Float[Array, "n 4 4"], B: Float[Array, "n 4 4"], X: Array, T: Array) -> float:
-    gap = log_poses(inverse_poses(A) @ (X[None] @ B @ T[None]))
-    return float(np.median(np.linalg.norm(gap[:, :3], axis=1) + np.linalg.norm(gap[:, 3:], axis=1)))
-
-
-def _pairs(A: Float[Array, "n 4 4"], B: Float[Array, "n 4 4"]) -> tuple[Array, Array]:
-    """Relative motions a X = X b with X = camera_from_mount: a = A_j A_i^-1, b = B_j B_i^-1, larger turns only."""
-    i, j = np.triu_indices(len(A), 1)
-    a, b = A[j] @ inverse_poses(A[i]), B[j] @ inverse_poses(B[i])
-    turn = np.linalg.norm(Rotation.from_matrix(b[:, :3, :3]).as_rotvec(), axis=1)
-    keep = (turn >= 0.5 * np.median(turn)) & (turn < np.radians(170))
-    return (a[keep], b[keep]) if keep.sum() >= 3 else (a, b)
-
-
-def park(A: Float[Array, "n 4 4"], B: Float[Array, "n 4 4"]) -> tuple[Array, Array]:
-    """Park and Martin 1994: R = (M^T M)^(-1/2) M^T from rotation vectors, then the translation by least squares."""
-    a, b = _pairs(A, B)
-    alpha, beta = (Rotation.from_matrix(m[:, :3, :3]).as_rotvec() for m in (a, b))
-    M = beta.T @ alpha
-    R = _nearest(np.real(np.linalg.pinv(np.asarray(sqrtm(M.T @ M))) @ M.T))
-    return _completed(A, B, a, b, R)
-
-
-def daniilidis(A: Float[Array, "n 4 4"], B: Float[Array, "n 4 4"]) -> tuple[Array, Array]:
-    """Daniilidis 1999: rotation and translation together from the null space of screw axes' dual quaternions."""
-    a, b = _pairs(A, B)
-    qa, da = _dual(a)
-    qb, db = _dual(b)
-    rows = []
-    for p, dp, q, dq in zip(qa, da, qb, db):
-        top = np.hstack([(p - q)[1:, None], skew(p[1:] + q[1:]), np.zeros((3, 4))])
-        low = np.hstack([(dp - dq)[1:, None], skew(dp[1:] + dq[1:]), (p - q)[1:, None], skew(p[1:] + q[1:])])
-        rows += [top, low]
-    _, _, vt = np.linalg.svd(np.vstack(rows))
-    u1, v1, u2, v2 = vt[6, :4], vt[6, 4:], vt[7, :4], vt[7, 4:]
-    real = _real_mix(u1, v1, u2, v2)
-    R = Rotation.from_quat(np.roll(real, -1)).as_matrix()
-    return _completed(A, B, a, b, R)
-
-
-def _real_mix(u1: Array, v1: Array, u2: Array, v2: Array) -> Float[Array, "4"]:
-    """The unit combination s1 (u1, v1) + s2 (u2, v2) that is a dual quaternion: u . v = 0, |u| = 1."""
-    coefficients = [u1 @ v1, u1 @ v2 + u2 @ v1, u2 @ v2]
-    best, found = -1.0, u2
-    for s in np.real(np.roots(coefficients)) if abs(coefficients[0]) > 1e-15 else np.array([0.0]):
-        mixed = s * u1 + u2
-        if mixed @ mixed > best:
-            best, found = float(mixed @ mixed), mixed
-    return found / np.linalg.norm(found)
-
-
-def _dual(motions: Float[Array, "n 4 4"]) -> tuple[Array, Array]:
-    """Unit quaternions wxyz with w >= 0 and their dual parts 0.5 (0, t) q."""
-    q = np.roll(Rotation.from_matrix(motions[:, :3, :3]).as_quat(canonical=True), 1, axis=1)
-    t = motions[:, :3, 3]
-    dual = 0.5 * np.column_stack([-np.einsum("ij,ij->i", t, q[:, 1:]), q[:, :1] * t + np.cross(t, q[:, 1:])])
-    return q, dual
-
-
-def _completed(A: Array, B: Array, a: Array, b: Array, R: Array) -> tuple[Array, Array]:
-    """The translation of X from (R_a - 1) t = R t_b - t_a, and T as the mean of (X B_i)^-1 A_i."""
-    left = (a[:, :3, :3] - np.eye(3)).reshape(-1, 3)
-    right = (b[:, :3, 3] @ R.T - a[:, :3, 3]).reshape(-1)
-    X = np.eye(4)
-    X[:3, :3], X[:3, 3] = R, np.linalg.lstsq(left, right, rcond=None)[0]
-    held = inverse_poses(X[None] @ B) @ A
-    T = np.eye(4)
-    T[:3, :3] = Rotation.from_matrix(held[:, :3, :3]).mean().as_matrix()
-    T[:3, 3] = np.median(held[:, :3, 3], axis=0)
-    return X, T
-
-
-def _nearest(matrix: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
-    u, _, vt = np.linalg.svd(matrix)
-    return u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
 
 
 @dataclass(frozen=True, eq=False)
@@ -252,9 +192,10 @@ class _Observations:
     views: Sequence[TargetView]
     moved: Float[Array, "n 4 4"]
     mounting: Mounting
+    lens: LensAccuracy
 
     def some(self, keep: Array) -> _Observations:
-        return _Observations(self.model, [v for v, k in zip(self.views, keep) if k], self.moved[keep], self.mounting)
+        return replace(self, views=[v for v, k in zip(self.views, keep) if k], moved=self.moved[keep])
 
     def corrected(self, off: Float[Array, "n 6"]) -> Float[Array, "n 4 4"]:
         """The arm errs in its tool's frame, which is on the right of base_from_tool and on the left of its inverse."""
@@ -270,7 +211,7 @@ def _refine(observations: _Observations, start: tuple[Array, Array], arm: ArmAcc
         arm = _measured_arm(solved, assumed, len(observations.views))
         solved = _solve(observations, (solved.camera_from_mount, solved.held_from_board), arm)
         worse = _measured_arm(solved, assumed, len(observations.views))
-        if worse.turn_deg < GROWS * arm.turn_deg and worse.shift_m < GROWS * arm.shift_m:
+        if worse.turn_deg < CONVERGED_RATIO * arm.turn_deg and worse.shift_m < CONVERGED_RATIO * arm.shift_m:
             break
     return solved
 
@@ -295,10 +236,10 @@ def _solve(observations: _Observations, start: tuple[Array, Array], arm: ArmAccu
         X = exp_poses(numbers[None, :6])[0] @ start[0]
         return X, exp_poses(numbers[None, 6:12])[0] @ start[1], numbers[12:].reshape(count, 6) * sigma
 
-    def gaps(numbers: Array) -> Array:
+    def gaps(numbers: Array, model: CameraModel = observations.model) -> Array:
         X, T, off = split(numbers)
         chain = (X[None] @ observations.corrected(off) @ T[None])[owner]
-        seen = observations.model.project(np.einsum("nij,nj->ni", chain[:, :3, :3], points) + chain[:, :3, 3])
+        seen = model.project(np.einsum("nij,nj->ni", chain[:, :3, :3], points) + chain[:, :3, 3])
         return np.where(np.isfinite(seen), seen - pixels, 1e3)
 
     def residuals(numbers: Array) -> Array:
@@ -307,10 +248,20 @@ def _solve(observations: _Observations, start: tuple[Array, Array], arm: ArmAccu
     numbers, J, left = _gauss_newton(residuals, np.zeros(12 + 6 * count), owner)
     X, T, off = split(numbers)
     scale = max(1.0, float(left @ left) / max(1, len(left) - len(numbers)))
-    covariance = scale * np.linalg.pinv(J.T @ J, hermitian=True)[:6, :6]
+    inverse = np.linalg.pinv(J.T @ J, hermitian=True)
+    covariance, weight = scale * inverse[:6, :6], _root_weights(residuals(numbers))
+    for other in observations.lens.others(observations.model):
+        change = np.einsum("nij,nj->ni", white, gaps(numbers, other) - gaps(numbers)).ravel()
+        moved = -(inverse @ J.T @ (weight * np.append(change, np.zeros(6 * count))))[:6]
+        covariance += np.outer(moved, moved)
     turns, shifts = np.linalg.norm(off[:, :3], axis=1), np.linalg.norm(off[:, 3:], axis=1)
     robot_deg, robot_mm = (float(np.sqrt((v**2).mean())) for v in (np.degrees(turns), 1e3 * shifts))
     return _Refined(X, T, covariance, -gaps(numbers), robot_deg, robot_mm)
+
+
+def _root_weights(residuals: Array) -> Array:
+    """Roots of Huber's weights."""
+    return np.sqrt(huber_weight(np.abs(residuals), HUBER))
 
 
 def _gauss_newton(residuals: Callable[[Array], Array], numbers: Array, owner: Array) -> tuple[Array, Array, Array]:
@@ -320,7 +271,7 @@ def _gauss_newton(residuals: Callable[[Array], Array], numbers: Array, owner: Ar
     trial = numbers
     for _ in range(STEPS):
         plain = residuals(trial)
-        weight = np.sqrt(huber_weight(np.abs(plain), HUBER))
+        weight = _root_weights(plain)
         cost = 2 * float(huber_cost(np.abs(plain), HUBER).sum())
         if cost < best:
             gain, best, numbers, damping = best - cost, cost, trial, max(damping / 10, 1e-9)

@@ -24,16 +24,16 @@ class FlightConfig:
     """How far from gravity the acceleration of flight may be; beyond three times this an arc hardly counts."""
     turn_rad_s2: float = 6.0
     center_sigma_m: float = 0.02
-    """Of the centre of mass about the middle of the tags."""
+    """Of the centre of mass about the centre of the tags."""
     rounds: int = 3
     """Of the arcs' robust weights."""
 
 
 def center_of_mass(
-    poses: Float[Array, "n 4 4"], order: Order, middle: Float[Array, "3"], config: FlightConfig
+    poses: Float[Array, "n 4 4"], order: Order, tags_center: Float[Array, "3"], config: FlightConfig
 ) -> Float[Array, "3"]:
     """c with p + R c falling: second differences of p + R c equal gravity in all triples that are nearly in flight
-    (robust linear least squares), and c is near the middle of the tags, as far as flight does not tell."""
+    (robust linear least squares), and c is near the centre of the tags, as far as flight does not tell."""
     rows, values = [], []
     for times, numbers in order.values():
         for k in range(1, len(numbers) - 1):
@@ -45,7 +45,7 @@ def center_of_mass(
             three = poses[numbers[k - 1 : k + 2]]
             rows.append(np.einsum("i,ijk->jk", shares, three[:, :3, :3]))
             values.append(GRAVITY_WORLD_M_S2 - shares @ three[:, :3, 3])
-    center = middle
+    center = tags_center
     if not rows:
         return center
     A, b = np.array(rows), np.array(values)
@@ -54,7 +54,7 @@ def center_of_mass(
         weight = 1 / (1 + (left / (2.5 * config.fall_m_s2)) ** 2) ** 2 / config.fall_m_s2**2
         near = 1 / config.center_sigma_m**2
         information = np.einsum("n,nij,nik->jk", weight, A, A) + near * np.eye(3)
-        center = np.linalg.solve(information, np.einsum("n,nij,ni->j", weight, A, b) + near * middle)
+        center = np.linalg.solve(information, np.einsum("n,nij,ni->j", weight, A, b) + near * tags_center)
     return center
 
 

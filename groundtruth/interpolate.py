@@ -35,7 +35,7 @@ class InterpolationConfig:
     """An interval longer than this many usual ones is a gap: what lies in it is uncertain."""
     meet_share: float = 0.25
     """Motions before and after an impact meet when they come nearer than this share of what parts them elsewhere."""
-    meet_doubt: float = 0.05
+    meet_sigma_share: float = 0.05
     """This share of it is doubt that one impact was all."""
     impact_steps: int = 40
     """Instants of an interval at which an impact is tried."""
@@ -78,7 +78,7 @@ def classify(
 ) -> Motion:
     """Kinds of all intervals. `ballistic[k]`: poses k-1, k, k+1 lie on one arc."""
     config = config or InterpolationConfig()
-    turns = _turns(poses)
+    turns = _rotations(poses)
     centers = poses[:, :3, 3] + poses[:, :3, :3] @ center_m
     kinds: list[Kind] = []
     for k in range(len(time_s) - 1):
@@ -87,7 +87,7 @@ def classify(
     return Motion(time_s, poses, center_m, tuple(kinds))
 
 
-def _turns(poses: Float[Array, "n 4 4"]) -> Float[Array, "m 3"]:
+def _rotations(poses: Float[Array, "n 4 4"]) -> Float[Array, "m 3"]:
     """Rotation vectors from each pose to the next, in the body."""
     R = Rotation.from_matrix(poses[:, :3, :3])
     return (R[:-1].inv() * R[1:]).as_rotvec() if len(poses) > 1 else np.zeros((0, 3))
@@ -165,7 +165,7 @@ def _arc(motion: Motion, k: int, t: float) -> Float[Array, "4 4"]:
     a, b = motion.time_s[k], motion.time_s[k + 1]
     u = (t - a) / (b - a)
     x = (1 - u) * _center(motion, k) + u * _center(motion, k + 1) - 0.5 * GRAVITY_WORLD_M_S2 * (t - a) * (b - t)
-    turn = _turns(motion.poses[k : k + 2])[0]
+    turn = _rotations(motion.poses[k : k + 2])[0]
     return _pose(motion, motion.poses[k, :3, :3] @ Rotation.from_rotvec(u * turn).as_matrix(), x)
 
 
@@ -175,30 +175,30 @@ def _cubic(motion: Motion, k: int, t: float) -> Float[Array, "4 4"]:
     u = (t - motion.time_s[k]) / h
     (va, wa), (vb, wb) = _slope(motion, k, k - 1), _slope(motion, k, k + 1)
     x = _hermite(u, h, _center(motion, k), _center(motion, k + 1), va, vb)
-    turn = _turns(motion.poses[k : k + 2])[0]
+    turn = _rotations(motion.poses[k : k + 2])[0]
     phi = _hermite(u, h, np.zeros(3), turn, wa, wb)
     return _pose(motion, motion.poses[k, :3, :3] @ Rotation.from_rotvec(phi).as_matrix(), x)
 
 
-def _slope(motion: Motion, inside: int, beside: int) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+def _slope(motion: Motion, inside: int, neighbour: int) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
     """Velocity and spin at the pose between two intervals, for the one inside: the mean of both, each weighted by the
     other's length; that of the arc where the one beside flies."""
     h = np.diff(motion.time_s)
     v, w = _rates(motion, inside)
-    if not 0 <= beside < len(h):
+    if not 0 <= neighbour < len(h):
         return v, w
-    other_v, other_w = _rates(motion, beside)
-    if motion.kinds[beside] == "ballistic":
-        sign = 0.5 if beside < inside else -0.5
-        return other_v + sign * h[beside] * GRAVITY_WORLD_M_S2, other_w
-    share = h[beside] / (h[beside] + h[inside])
+    other_v, other_w = _rates(motion, neighbour)
+    if motion.kinds[neighbour] == "ballistic":
+        sign = 0.5 if neighbour < inside else -0.5
+        return other_v + sign * h[neighbour] * GRAVITY_WORLD_M_S2, other_w
+    share = h[neighbour] / (h[neighbour] + h[inside])
     return share * v + (1 - share) * other_v, share * w + (1 - share) * other_w
 
 
 def _rates(motion: Motion, k: int) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
     """Mean velocity of the centre and mean spin over an interval."""
     h = float(motion.time_s[k + 1] - motion.time_s[k])
-    return (_center(motion, k + 1) - _center(motion, k)) / h, _turns(motion.poses[k : k + 2])[0] / h
+    return (_center(motion, k + 1) - _center(motion, k)) / h, _rotations(motion.poses[k : k + 2])[0] / h
 
 
 def _hermite(u: float, h: float, a: Array, b: Array, slope_a: Array, slope_b: Array) -> Array:
@@ -250,13 +250,13 @@ def _meeting(
     tried: Float[Array, " s"], gaps: Float[Array, "s 3"], t: float, config: InterpolationConfig
 ) -> _Meeting | None:
     """The instant at which two motions are nearest, if that is near against what parts them at the interval's ends."""
-    apart = np.linalg.norm(gaps, axis=1)
-    best = int(np.argmin(apart))
-    if apart[best] > config.meet_share * max(apart[0], apart[-1]):
+    distance = np.linalg.norm(gaps, axis=1)
+    best = int(np.argmin(distance))
+    if distance[best] > config.meet_share * max(distance[0], distance[-1]):
         return None
     a, b, impact = float(tried[0]), float(tried[-1]), float(tried[best])
     share = (impact - a) / (b - a)
-    loose = 0.5 * float(apart[best]) + config.meet_doubt * float(max(apart[0], apart[-1]))
+    loose = 0.5 * float(distance[best]) + config.meet_sigma_share * float(max(distance[0], distance[-1]))
     if t < impact:
         along = (t - a) / (impact - a)
         return _Meeting(True, share * along * gaps[best], loose * along)
@@ -282,7 +282,7 @@ def _line(motion: Motion, k: int, t: float) -> Float[Array, "4 4"]:
     """Constant speed and turn through poses k and k+1."""
     a, b = float(motion.time_s[k]), float(motion.time_s[k + 1])
     u = (t - a) / (b - a)
-    turn = _turns(motion.poses[k : k + 2])[0]
+    turn = _rotations(motion.poses[k : k + 2])[0]
     x = (1 - u) * _center(motion, k) + u * _center(motion, k + 1)
     return _pose(motion, motion.poses[k, :3, :3] @ Rotation.from_rotvec(u * turn).as_matrix(), x)
 
@@ -291,13 +291,13 @@ def _bend(motion: Motion, k: int, clean: int | None) -> tuple[float, float]:
     """How far from the chord the motion may be (m, rad) where one side of an impact is not known: by the change of
     speed against the side that is; half of it where none is."""
     h = float(motion.time_s[k + 1] - motion.time_s[k])
-    spins = _turns(motion.poses[k : k + 2])[0] / h
+    spins = _rotations(motion.poses[k : k + 2])[0] / h
     speed = (_center(motion, k + 1) - _center(motion, k)) / h
     if clean is None:
         return 0.125 * h * float(np.linalg.norm(speed)), 0.125 * h * float(np.linalg.norm(spins))
     g = float(motion.time_s[clean + 1] - motion.time_s[clean])
     other = (_center(motion, clean + 1) - _center(motion, clean)) / g
-    spun = _turns(motion.poses[clean : clean + 2])[0] / g
+    spun = _rotations(motion.poses[clean : clean + 2])[0] / g
     return 0.25 * h * float(np.linalg.norm(speed - other)), 0.25 * h * float(np.linalg.norm(spins - spun))
 
 
@@ -313,5 +313,5 @@ def _outside(motion: Motion, t: float, config: InterpolationConfig) -> tuple[Flo
     k = 0 if first else n - 2
     h = float(motion.time_s[k + 1] - motion.time_s[k])
     way = float(np.linalg.norm(_center(motion, k + 1) - _center(motion, k))) / h * abs(t - end)
-    turn = float(np.linalg.norm(_turns(motion.poses[k : k + 2])[0])) / h * abs(t - end)
+    turn = float(np.linalg.norm(_rotations(motion.poses[k : k + 2])[0])) / h * abs(t - end)
     return _carried(motion, k, t), 0.2 * way, 0.2 * turn

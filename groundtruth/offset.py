@@ -62,26 +62,26 @@ def object_from_tagged_by_mesh(
     corners = np.concatenate([sizes_m[i] * CORNERS_PUPIL @ T[:3, :3].T + T[:3, 3] for i, T in layout.items()])
     outward = np.repeat(np.array([-T[:3, 2] for T in layout.values()]), len(CORNERS_PUPIL), axis=0)
     surface = _Surface(vertices_m, faces)
-    middle = 0.5 * (vertices_m.min(axis=0) + vertices_m.max(axis=0))
+    center = 0.5 * (vertices_m.min(axis=0) + vertices_m.max(axis=0))
     random = list(Rotation.random(120, random_state=np.random.default_rng(0)).as_matrix())
-    rough = [_fitted(surface, corners, outward, start, middle, 8) for start in cube_turns() + random]
+    rough = [_fitted(surface, corners, outward, start, center, 8) for start in cube_rotations() + random]
     few = sorted(rough, key=lambda f: f[1])[:12]
-    fits = [_fitted(surface, corners, outward, pose[:3, :3], middle, 25) for pose, _ in few]
+    fits = [_fitted(surface, corners, outward, pose[:3, :3], center, 25) for pose, _ in few]
     first = min(fits, key=lambda f: f[1])[0]
-    fits += [_fitted(surface, corners, outward, S @ first[:3, :3], middle, 8) for S in cube_turns()]
+    fits += [_fitted(surface, corners, outward, S @ first[:3, :3], center, 8) for S in cube_rotations()]
     best = min(rms for _, rms in fits)
     alike: list[Array] = []
     for pose, rms in sorted(fits, key=lambda f: f[1]):
-        if rms < 1.2 * best + 1e-4 and all(_apart(pose, other) > np.radians(5) for other in alike):
+        if rms < 1.2 * best + 1e-4 and all(_angle_between(pose, other) > np.radians(5) for other in alike):
             alike.append(pose)
     return Fit(Transform.from_matrix("object", "tagged", alike[0]), best, len(alike))
 
 
-def _apart(a: Array, b: Array) -> float:
+def _angle_between(a: Array, b: Array) -> float:
     return float(Rotation.from_matrix(a[:3, :3].T @ b[:3, :3]).magnitude())
 
 
-def cube_turns() -> list[Float[Array, "3 3"]]:
+def cube_rotations() -> list[Float[Array, "3 3"]]:
     """The 24 turns that leave a cube as it is."""
     turns = []
     for order in itertools.permutations(range(3)):
@@ -118,12 +118,12 @@ def _fitted(
     corners: Float[Array, "n 3"],
     outward: Float[Array, "n 3"],
     start: Float[Array, "3 3"],
-    middle: Float[Array, "3"],
+    center: Float[Array, "3"],
     turns: int,
 ) -> tuple[Float[Array, "4 4"], float]:
     pose = np.eye(4)
     pose[:3, :3] = start
-    pose[:3, 3] = middle - start @ corners.mean(axis=0)
+    pose[:3, 3] = center - start @ corners.mean(axis=0)
     rms = np.inf
     for turning in [False] * 6 + [True] * turns:  # first into place: the tags' middle need not be the object's
         moved = corners @ pose[:3, :3].T + pose[:3, 3]
@@ -146,9 +146,9 @@ def _fitted(
         if turning and np.linalg.norm(step) < 1e-7:
             break
     turned = outward @ pose[:3, :3].T
-    middles = slice(len(CORNERS_PUPIL) - 1, None, len(CORNERS_PUPIL))
-    above = (corners @ pose[:3, :3].T + pose[:3, 3] + (2 * rms + 0.001) * turned)[middles]
-    return pose, rms if surface.outside(above, turned[middles] + 1e-4) else 1.0
+    centers = slice(len(CORNERS_PUPIL) - 1, None, len(CORNERS_PUPIL))
+    above = (corners @ pose[:3, :3].T + pose[:3, 3] + (2 * rms + 0.001) * turned)[centers]
+    return pose, rms if surface.outside(above, turned[centers] + 1e-4) else 1.0
 
 
 def _lean(normals: Float[Array, "n 3"]) -> Float[Array, "m 3"]:

@@ -267,8 +267,8 @@ def enlarged(detections: Detections, by_px: float) -> Detections:
 
     def larger(s: TagSeen) -> TagSeen:
         corners = s.tag.corners_px
-        middle = corners.mean(axis=0)
-        return replace(s, tag=replace(s.tag, corners_px=middle + (corners - middle) * (1 + by_px / _edge(corners))))
+        center = corners.mean(axis=0)
+        return replace(s, tag=replace(s.tag, corners_px=center + (corners - center) * (1 + by_px / _edge(corners))))
 
     return replace(detections, seen=tuple(larger(s) for s in detections.seen))
 

@@ -136,10 +136,10 @@ def solve_session(
     solution, loosened, left, by_chance = _without_wrong_places(
         graph, solution, problem, index, config, settings.solver
     )
-    middle = np.mean([solution.poses[index[tag_key(i)]][:3, 3] for i in roles.body if tag_key(i) in index], axis=0)
-    center = middle
+    tags_center = np.mean([solution.poses[index[tag_key(i)]][:3, 3] for i in roles.body if tag_key(i) in index], axis=0)
+    center = tags_center
     for _ in range(config.flight.rounds):
-        center = center_of_mass(solution.poses, order, middle, config.flight)
+        center = center_of_mass(solution.poses, order, tags_center, config.flight)
         graph.arcs = arcs_of(solution.poses, order, center, config.flight)
         if not graph.arcs:
             break
@@ -361,12 +361,14 @@ def _moved(places: Mapping[tuple[str, int], Float[Array, "4 4"]]) -> dict[tuple[
     found: dict[tuple[str, int], tuple[float, float]] = {}
     for camera in sorted({name for name, _ in places}):
         mine = {toss: pose for (name, toss), pose in places.items() if name == camera}
-        usual = min(mine.values(), key=lambda p: sum(_apart(p, q)[1] + 0.5 * _apart(p, q)[0] for q in mine.values()))
-        found |= {(camera, toss): _apart(usual, pose) for toss, pose in mine.items()}
+        usual = min(
+            mine.values(), key=lambda p: sum(_difference(p, q)[1] + 0.5 * _difference(p, q)[0] for q in mine.values())
+        )
+        found |= {(camera, toss): _difference(usual, pose) for toss, pose in mine.items()}
     return found
 
 
-def _apart(a: Float[Array, "4 4"], b: Float[Array, "4 4"]) -> tuple[float, float]:
+def _difference(a: Float[Array, "4 4"], b: Float[Array, "4 4"]) -> tuple[float, float]:
     xi = se3.log((np.linalg.inv(a) @ b)[None])[0]
     return float(np.linalg.norm(xi[:3])), float(np.linalg.norm(xi[3:]))
 

@@ -11,7 +11,7 @@ from scipy.stats import chi2
 
 from groundtruth.factors import Prior, prior_terms
 
-TOLD = 0.05
+LEAST_SHARE = 0.05
 """Share of a prior's variance that the rest must take away for a direction to say anything of it."""
 
 
@@ -38,9 +38,9 @@ def tension(prior: Prior, poses: Float[Array, "n 4 4"], covariance: Float[Array,
     (the innovation, Bar-Shalom et al. 2001, 5.4). A direction of which nothing else is known (C near 1) tells nothing.
     """
     error = prior_terms([prior], poses)[0][0]
-    told, directions = np.linalg.eigh(np.eye(6) - prior.root_information @ covariance @ prior.root_information.T)
-    known = told > TOLD
+    share, directions = np.linalg.eigh(np.eye(6) - prior.root_information @ covariance @ prior.root_information.T)
+    known = share > LEAST_SHARE
     if not known.any():
         return Tension()
-    squares = (directions.T @ error)[known] ** 2 / told[known]
+    squares = (directions.T @ error)[known] ** 2 / share[known]
     return Tension(float(np.sqrt(squares.mean())), int(known.sum()))

@@ -137,9 +137,9 @@ def _drift(solved: Solved, calibration: RigCalibration) -> list[str]:
                 f"{name} has no place in calibration.json, tags placed it; `toss-calibrate cameras` does so far better"
             )
             continue
-        apart = np.linalg.inv(known.matrix) @ pose
-        shift = float(np.linalg.norm(apart[:3, 3]))
-        turn = float(np.arccos(np.clip((np.trace(apart[:3, :3]) - 1) / 2, -1, 1)))
+        difference = np.linalg.inv(known.matrix) @ pose
+        shift = float(np.linalg.norm(difference[:3, 3]))
+        turn = float(np.arccos(np.clip((np.trace(difference[:3, :3]) - 1) / 2, -1, 1)))
         if shift > 0.003 or turn > 0.005:
             found.append(
                 f"{name} stands {1000 * shift:.1f} mm and {np.degrees(turn):.2f} deg from its place in "

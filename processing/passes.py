@@ -10,11 +10,12 @@ from typing import Any
 import numpy as np
 from scipy.stats import t as student
 
-from processing.config import CycleConfig
+from processing.images import Images
 from processing.refine.icp import ShapeSurface
 from processing.refine.image_residuals import CHANCE
-from processing.stages.held_out import Half
-from processing.stages.judge import JudgeResult
+from processing.run import Run, both, each
+from processing.stages.held_out import Half, judge_by_contact, losses_of
+from processing.stages.judge import judge
 from processing.store import Done
 from recordings.geometry import rotation_angle_rad
 from recordings.notices import Notice
@@ -57,18 +58,20 @@ class Pass:
         )
 
 
-def comparison(
-    before: Pass,
-    after: Pass,
-    judged: tuple[Done[JudgeResult], Done[JudgeResult]],
-    contact: tuple[Mapping[int, float], Mapping[int, float]],
-    name: str,
-    config: CycleConfig,
-) -> dict[str, Any]:
+def comparison(run: Run, before: Pass, after: Pass, images: Mapping[int, Images], name: str) -> dict[str, Any]:
     """What changed from one pass to the next, and which of them explains the raw images better (`worse_share`: mean of
-    how much larger the residuals are, as a share); and the contact of tosses held out, where `contact` has losses (J)
-    of both passes."""
-    was, now = (asdict(j.result) for j in judged)
+    how much larger the residuals are, as a share); and the contact loss (J) of tosses held out, where both passes have
+    one."""
+
+    def explained(of: Pass) -> dict[str, Any]:
+        return asdict(judge(run, name, of.tracks, of.shapes, images).result)
+
+    def contact_j(of: Pass) -> dict[int, float]:
+        judged = each(run, of.halves, lambda half: judge_by_contact(run, name, of.tracks, half))
+        return losses_of([*judged.values()])
+
+    was, now = both(run, lambda: explained(before), lambda: explained(after))
+    contact = both(run, lambda: contact_j(before), lambda: contact_j(after))
     shares = [now[k] / was[k] - 1 for k in ("depth_m", "mask", "color") if was[k] and now[k] is not None]
     if all(contact):
         shares.append(certain_share(*contact))
@@ -76,7 +79,7 @@ def comparison(
     if now["frames"] + now["lost"]:
         shares.append((now["lost"] - was["lost"]) / (now["frames"] + now["lost"]))
     turned, moved = pose_change(before.tracks, after.tracks)
-    grown = shape_change(before.shapes, after.shapes)
+    grown, config = shape_change(before.shapes, after.shapes), run.config.cycle
     same = turned < config.same_rotation_deg and moved < config.same_translation_m and grown < config.same_shape_m
     return {
         "of": name, "before": was, "after": now, "worse_share": float(np.mean(shares)) if shares else 0.0,

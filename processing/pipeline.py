@@ -10,8 +10,8 @@ from pathlib import Path
 from processing import stage_notices as say
 from processing.baselines.frame_to_model import FrameToModel
 from processing.cycle import run_cycle
+from processing.first_pass import first_pass, start_alone
 from processing.images import Images, every_frame, raw_images
-from processing.one_shape import kept_apart
 from processing.passes import Pass
 from processing.record import write_record
 from processing.run import Run, each
@@ -20,15 +20,13 @@ from processing.stages.field import learn_field
 from processing.stages.find import find_object
 from processing.stages.lose import lose, without_lost
 from processing.stages.model import bring_model
-from processing.stages.place import place_shape
-from processing.stages.register import register
 from processing.stages.rig import refine_rig, with_depth_in_time
 from processing.stages.rollouts import roll_out
 from processing.stages.scene import learn_static_scene, measure_noise
 from processing.stages.segment import segment
 from processing.stages.track import track
 from processing.store import Done
-from processing.variants import Variant, refuse_baseline
+from processing.variants import Variant
 from recordings.results.folder import Scope, VariantRecord
 from recordings.session import RgbdFrames
 
@@ -47,11 +45,10 @@ def process(run: Run, variant: Variant, scope: Scope, model: Path | None = None)
     images = {t: raw_images(run, t, rig, masks[t]) for t in run.tosses}
     if model is not None:
         last = with_model(run, images, model)
+    elif variant.first == "one_toss":
+        last = one_by_one(run, tracked_alone(run, images), images, scope)
     else:
-        follow = track_to_model if run.tracker == FrameToModel.name else track
-        alone = each(run, run.tosses, lambda t: follow(run, images[t]))  # p_i
-        last = one_by_one(run, alone, images, scope) if variant.first == "one_toss" else (
-            together(run, variant, scope, alone, images))  # fmt: skip
+        last = together(run, variant, scope, tracked_alone(run, images), images)
     lost = {t: lose(run, t, masks[t]) for t in run.lost}
     return write_record(run, variant, scope, last, lost, scene, rig, masks)
 
@@ -69,8 +66,14 @@ def with_model(run: Run, images: Mapping[int, Images], model: Path) -> Pass:
                 notes=(f"shape: {model.name}",))  # fmt: skip
 
 
+def tracked_alone(run: Run, images: Mapping[int, Images]) -> dict[int, Done]:
+    """p_i: every toss by itself."""
+    follow = track_to_model if run.tracker == FrameToModel.name else track
+    return each(run, run.tosses, lambda t: follow(run, images[t]))
+
+
 def one_by_one(run: Run, alone: Mapping[int, Done], images: Mapping[int, Images], scope: Scope) -> Pass:
-    """p_i, O_i: in scope all only the first toss's shape is looked at."""
+    """The row p_i, O_i: in scope all only the first toss's shape is looked at."""
     notes, warnings = ("each toss has its own object frame",), say.of_tracks(alone)
     if run.tracker == FrameToModel.name:
         return Pass(alone, alone, shared_frame=False, warnings=warnings, notes=notes)
@@ -82,48 +85,29 @@ def one_by_one(run: Run, alone: Mapping[int, Done], images: Mapping[int, Images]
 
 def together(run: Run, variant: Variant, scope: Scope, alone: Mapping[int, Done], images: Mapping[int, Images]) -> Pass:
     """The rows that begin with P and O; then the cycle on all tosses, or in scope one on every toss from p_i and O."""
-    first = first_pass(run, alone, images)
-    last = first
+    first = last = first_pass(run, alone, images)
+
+    def cycle_of(toss: int) -> Pass:
+        start = start_alone(run, toss, first, alone[toss], images)
+        return run_cycle(run, variant, start, images, f"toss {toss}")
+
     if variant.refined is not None and scope == "all":
-        last = run_cycle(run, variant, first, images, "all tosses")
-        if variant.icp and last.contact:  # the paper's Figure 4
-            rolled = roll_out(run, "all tosses", last.tracks, last.shape)
-            last = replace(last, rollout=None if rolled.result.kept_out else rolled,
-                           warnings=(*last.warnings, *say.no_rollouts(rolled)))  # fmt: skip
+        last = with_rollouts(run, variant, run_cycle(run, variant, first, images, "all tosses"))
     elif variant.refined is not None:
-        last = Pass.joined([*each(run, first.tracks, lambda t: run_cycle(
-            run, variant, start_alone(run, t, first, alone[t], images), images, f"toss {t}")).values()])  # fmt: skip
+        last = Pass.joined([*each(run, first.tracks, cycle_of).values()])
     apart = {t: alone[t] for t in run.tosses if t not in last.tracks}  # in their own object frames
     shapes = each(run, apart, lambda t: learn_field(run, f"toss {t}", {t: alone[t]}, images))
     return replace(last, tracks={**last.tracks, **apart}, shapes={**last.shapes, **shapes},
                    shared_frame=last.shared_frame and not apart)  # fmt: skip
 
 
-def first_pass(run: Run, alone: Mapping[int, Done], images: Mapping[int, Images]) -> Pass:
-    """P, O: all tosses in one object frame, and one shape. Tosses that the shape of all does not explain are kept
-    apart, and the others joined anew: they were refined together with the wrong ones."""
-    refuse_baseline(run.tracker)
-    tosses, warnings = run.tosses, list(say.of_tracks(alone))
-    while True:
-        placed = register(run, {t: alone[t] for t in tosses}, images)
-        joined = [t for t in tosses if t not in placed.result.not_joined]
-        shape = learn_field(run, "all tosses", dict.fromkeys(joined, placed), images)
-        apart = kept_apart(run, placed, shape, images, joined)
-        if not apart:
-            warnings += say.of_register(placed)
-            return Pass(dict.fromkeys(tosses, placed), dict.fromkeys(tosses, shape),
-                        shared_frame=tosses == run.tosses, warnings=tuple(warnings))  # fmt: skip
-        warnings.append(say.kept_apart(apart))
-        tosses = tuple(t for t in tosses if t not in apart)
-
-
-def start_alone(run: Run, toss: int, first: Pass, alone: Done, images: Mapping[int, Images]) -> Pass:
-    """Where the cycle begins on one toss: p_i, and O in its object frame. A toss that is lost in P does not say how O
-    lies in it (it may be another object's): its own shape is taken."""
-    placed: Done = place_shape(run, toss, first.tracks[toss], alone, first.shapes[toss])
-    lost = not placed.result.frames
-    shape = learn_field(run, f"toss {toss}", {toss: alone}, images) if lost else placed
-    return Pass({toss: alone}, {toss: shape}, shared_frame=False, warnings=say.lost_among_all(toss) if lost else ())
+def with_rollouts(run: Run, variant: Variant, last: Pass) -> Pass:
+    """The paper's Figure 4, of rows with contact and ICP."""
+    if not (variant.icp and last.contact):
+        return last
+    rolled = roll_out(run, "all tosses", last.tracks, last.shape)
+    warnings = (*last.warnings, *say.no_rollouts(rolled))
+    return replace(last, rollout=None if rolled.result.kept_out else rolled, warnings=warnings)
 
 
 def metric_frames_of(run: Run) -> dict[int, RgbdFrames]:

@@ -48,11 +48,18 @@ def find_poses(
 
 
 class PoseSource:
-    """Where poses came from, the poses, the shape in their object frame where there is one, and what a reader should
-    know of them."""
+    """Where poses came from, the poses, the shape in their object frame where there is one, what a reader should know
+    of them, and whether vision made them (else they were imported)."""
 
-    def __init__(self, name: str, tracks: list[PoseSeries], shape: ObjectShape | None, note: str | None = None) -> None:
-        self.name, self.tracks, self.shape, self.note = name, tracks, shape, note
+    def __init__(
+        self,
+        name: str,
+        tracks: list[PoseSeries],
+        shape: ObjectShape | None,
+        note: str | None = None,
+        of_vision: bool = False,
+    ) -> None:
+        self.name, self.tracks, self.shape, self.note, self.of_vision = name, tracks, shape, note, of_vision
 
 
 def _truth_poses(session: Session, tosses: Sequence[int], given: Path | None, vision: PoseSource | None) -> PoseSource:
@@ -123,5 +130,5 @@ def _vision(out_dir: Path) -> PoseSource | None:
             record = results.find(name, "all")
             tracks = [PoseSeries.from_track(t, record.calibration) for t in results.tracks(name, "all").values()]
             usable = [t for t in tracks if len(t) >= 5]
-            return PoseSource(f"track of variant {name}", usable, results.shape(name, "all"))
+            return PoseSource(f"track of variant {name}", usable, results.shape(name, "all"), of_vision=True)
     return None

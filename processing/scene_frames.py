@@ -39,7 +39,7 @@ class SceneFrames:
     left_out: dict[int, str]
 
 
-def tosses_beside(run: Run) -> tuple[int, ...]:
+def background_tosses(run: Run) -> tuple[int, ...]:
     """Tosses of the session that are not of the run and may show its background, spread evenly."""
     others = [t for t in run.session.tosses if t not in run.recorded]
     wanted = max(0, run.config.scene.frames // LEAST_EACH - len(run.recorded))
@@ -47,9 +47,9 @@ def tosses_beside(run: Run) -> tuple[int, ...]:
     return tuple(others[i] for i in at)
 
 
-def keys_beside(run: Run) -> dict[str, str]:
+def background_keys(run: Run) -> dict[str, str]:
     """Fingerprints of their files, for the stage's key: a file that changes, comes or goes makes another scene."""
-    return {f"beside_{t:02d}": _fingerprint(run.session.file(t)) for t in tosses_beside(run)}
+    return {f"beside_{t:02d}": _fingerprint(run.session.file(t)) for t in background_tosses(run)}
 
 
 def _fingerprint(path: Path) -> str:
@@ -70,7 +70,7 @@ def scene_frames(run: Run) -> SceneFrames:
     """The frames that the scene is learned from. Raises TosslabError only for tosses of the run."""
     streams = {t: run.session.toss(t).rgbd(CAMERA) for t in run.recorded}
     left_out = {}
-    for t in tosses_beside(run):
+    for t in background_tosses(run):
         try:
             streams[t] = run.session.toss(t).rgbd(CAMERA)
         except (TosslabError, OSError) as wrong:
@@ -91,16 +91,16 @@ def _spread(streams: dict[int, RgbdFrames], wanted: int) -> list[tuple[int, int]
 
 def _unfit(run: Run, streams: dict[int, RgbdFrames], chosen: Sequence[tuple[int, int]]) -> dict[int, str]:
     """Why tosses beside the run's cannot be used."""
-    beside = [t for t in streams if t not in run.recorded]
+    others = [t for t in streams if t not in run.recorded]
     of_run = [at for at in chosen if at[0] in run.recorded]
-    if not beside or not of_run:
+    if not others or not of_run:
         return {}
     toss, position = of_run[len(of_run) // 2]
     reference = streams[toss][position]
     robot = RobotOfSession(run.session)
     known = robot.missing(run.recorded) is None
     bad = {}
-    for t in beside:
+    for t in others:
         at = [(i, p) for i, p in chosen if i == t]
         try:
             if known and robot.path(t) is None:

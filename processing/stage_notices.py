@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -20,6 +19,7 @@ from processing.stages.track import TrackResult
 from processing.store import Done
 from recordings.mcap import arm_codec
 from recordings.notices import Notice
+from recordings.results.stage_files import stage_document
 
 NOISY = 2.0
 """Depth that errs by this much more than the data sheet says is told."""
@@ -113,7 +113,7 @@ def of_track(toss: int, done: Done[TrackResult]) -> list[Notice]:
 def of_contact(done: Done) -> list[Notice]:
     """What contact learning says of itself."""
     path = done.folder / "result.json"
-    stored = json.loads(path.read_text()).get("warnings", []) if path.exists() else []
+    stored = stage_document(path).get("warnings", []) if path.exists() else []
     return [Notice.from_json(n) for n in stored]
 
 

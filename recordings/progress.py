@@ -78,14 +78,14 @@ class Pace:
         if not self._reports or done > self._reports[-1][1]:
             self._reports.append((now_s, done))
         if self._watched() and not self._agree():
-            self._reports = self._reports[self._middle() :]
+            self._reports = self._reports[self._halfway() :]
 
     def left_s(self, now_s: float) -> float | None:
         """Seconds still to go; None where nobody can know."""
         if not self._watched():
             return None
         end_s, done = self._reports[-1]
-        each_s, waited_s = _seconds_each(self._reports[self._middle()], self._reports[-1]), now_s - end_s
+        each_s, waited_s = _seconds_each(self._reports[self._halfway()], self._reports[-1]), now_s - end_s
         if waited_s > self.AGREE * each_s + self.LEAST_S:  # a step that takes longer than those before it
             return None
         return max(each_s * (self._total - done) - waited_s, 0.0)
@@ -93,14 +93,14 @@ class Pace:
     def _watched(self) -> bool:
         return len(self._reports) > 2 and self._reports[-1][0] - self._reports[0][0] >= self.LEAST_S
 
-    def _middle(self) -> int:
+    def _halfway(self) -> int:
         """The step nearest to the middle of the time that was watched."""
         half_s = 0.5 * (self._reports[0][0] + self._reports[-1][0])
         return min(range(1, len(self._reports) - 1), key=lambda i: abs(self._reports[i][0] - half_s))
 
     def _agree(self) -> bool:
-        middle = self._reports[self._middle()]
-        older, newer = _seconds_each(self._reports[0], middle), _seconds_each(middle, self._reports[-1])
+        halfway = self._reports[self._halfway()]
+        older, newer = _seconds_each(self._reports[0], halfway), _seconds_each(halfway, self._reports[-1])
         return max(older, newer) <= self.AGREE * min(older, newer)
 
 

@@ -137,3 +137,19 @@ def test_long_files_and_long_functions_need_a_reason_of_their_own(check):
     long_function = "def f():\n" + "    x = 1\n" * 80
     assert len(list(check.too_long("a.py", long_function + "# long because: not in the function\n"))) == 1
     assert not list(check.too_long("a.py", long_function + "    # long because: one compiled loop\n    x = 2\n"))
+
+
+def test_no_paragraph_of_the_architecture_is_longer_than_120_words_and_every_file_it_names_is_there():
+    text = (ROOT / "ARCHITECTURE.md").read_text()
+    prose = re.sub(r"```.*?```", "", text, flags=re.S)
+    blocks = re.split(r"\n\s*\n|\n(?=\d+\. |- |\|)", prose)
+    long = [(len(b.split()), b[:60]) for b in blocks if len(b.split()) > 120]
+    assert not long
+    packages = "acquisition|calibration|groundtruth|processing|recordings"
+    named = set(re.findall(rf"`((?:{packages}|tools)/[\w/]+\.py)`", text))
+    assert len(named) > 30
+    assert not [name for name in named if not (ROOT / name).is_file()]
+
+
+def test_the_pipeline_is_on_one_screen():
+    assert len((ROOT / "processing" / "pipeline.py").read_text().splitlines()) <= 120

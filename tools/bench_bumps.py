@@ -96,8 +96,8 @@ def errors_mm(found: Solved, made: TossLab) -> tuple[float, float]:
     """Root mean square over the toss of the error of the object's place, and of the stated deviation of the body's: in
     the world, nothing aligned."""
     track = found.tracks[0]
-    middle_m = np.mean([(T @ np.linalg.inv(made.layout[i]))[:3, 3] for i, T in found.layout.items()], axis=0)
-    placed: Float[Array, "n 3"] = track.world_from_tagged[:, :3, :3] @ middle_m + track.world_from_tagged[:, :3, 3]
+    centroid_m = np.mean([(T @ np.linalg.inv(made.layout[i]))[:3, 3] for i, T in found.layout.items()], axis=0)
+    placed: Float[Array, "n 3"] = track.world_from_tagged[:, :3, :3] @ centroid_m + track.world_from_tagged[:, :3, 3]
     off = placed - made.truth[0][:, :3, 3]
     stated = np.einsum("nii->n", track.covariance[:, 3:, 3:]).mean()
     return 1e3 * float(np.sqrt((off**2).sum(axis=1).mean())), 1e3 * float(np.sqrt(stated))

@@ -32,7 +32,7 @@ from calibration.cameras.intrinsics import Lens, calibrate_intrinsics
 from calibration.cameras.lens_fit import gain_by_chance, squares_aside
 from calibration.cameras.poses import angle_deg
 from calibration.cameras.targets import Charuco, Chessboard, TargetView, find_target
-from calibration.hand_eye import calibrate_hand_eye
+from calibration.hand_eye import LensAccuracy, calibrate_hand_eye
 from recordings.geometry import CameraModel
 
 SETS = Path(os.environ.get("TOSSLAB_CALIBRATION_SETS", Path.home() / ".cache" / "tosslab-calibration"))
@@ -234,23 +234,28 @@ def hand() -> str:
     if not images:
         return f"paper-hand     skipped: no {real.pictures} under {SETS}; set TOSSLAB_CALIBRATION_SETS"
     found, size = find_target(real.board, images), (images[0].shape[1], images[0].shape[0])
-    own = calibrate_intrinsics("color", size, find_target(lens_views.board, lens_views.images())).model
+    own = calibrate_intrinsics("color", size, find_target(lens_views.board, lens_views.images()))
     folder = SETS / PAPER / "extrinsics"
     base_from_tool = np.array([visp_pose(folder / f"pose_fPe_{k:02d}.yaml") for k in range(1, len(images) + 1)])
     text = "paper-hand    "
-    for name, lens in (("our lens", own), ("published lens", published_lens(lens_views, size))):
-        text += f" {name}: {hand_against(lens, found, base_from_tool, visp_pose(folder / 'eMc.yaml'))};"
+    published = published_lens(lens_views, size)
+    for name, lens, sure in (
+        ("our lens", own.model, LensAccuracy.stated(own.report.uncertainty)),
+        ("published lens", published, LensAccuracy()),
+    ):
+        text += f" {name}: {hand_against(lens, sure, found, base_from_tool, visp_pose(folder / 'eMc.yaml'))};"
     return text
 
 
 def hand_against(
     lens: CameraModel,
+    sure: LensAccuracy,
     found: Sequence[TargetView],
     base_from_tool: Float[Array, "n 4 4"],
     published_tool_from_camera: Float[Array, "4 4"],
 ) -> str:
     """How far the camera stands from its published place, and twice the deviation stated for it."""
-    solved = calibrate_hand_eye(lens, found, base_from_tool, "eye-in-hand")
+    solved = calibrate_hand_eye(lens, found, base_from_tool, "eye-in-hand", lens=sure)
     gap = solved.camera_from_mount @ published_tool_from_camera
     sure = solved.report.uncertainty
     return (

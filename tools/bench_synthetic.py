@@ -12,12 +12,12 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
+from synthetic.presets import preset
 from variety import depth_check
 
 from acquisition.synthetic.config import MonoConfig
 from acquisition.synthetic.lab import Lab
 from acquisition.synthetic.planner import Motion
-from acquisition.synthetic.presets import preset
 
 REPEATS = 8
 

@@ -23,13 +23,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
+from synthetic.infrared_dots import corner_noise_px, dots_advice, with_infrared_dots
 
 from calibration.cameras.extrinsics import board_pose
 from calibration.cameras.poses import angle_deg, inverse_poses
 from calibration.cameras.targets import Tags, TargetView
 from calibration.hand_eye import calibrate_hand_eye
 from calibration.tags.detect import detect_tags
-from calibration.tags.infrared_dots import corner_noise_px, dots_advice
 from recordings.geometry import CameraModel
 from recordings.tracks import RigCalibration
 
@@ -233,8 +233,6 @@ def _hand_eye(runs: int, board_deg: float, arm_m: float, label: str) -> list[str
 
 def dots(given: Given) -> list[str]:
     """Infrared dots rendered into cube_dev's first board view of each mono camera: how far they move corners."""
-    from acquisition.synthetic.render.dots import with_infrared_dots
-
     lines, rng = [], np.random.default_rng(0)
     for camera in ("mono0", "mono1", "mono2"):
         image = cv2.imread(str(DATA / "cube_dev/calibration/view_00" / f"{camera}.png"), cv2.IMREAD_GRAYSCALE)

@@ -43,7 +43,7 @@ KERNELS: dict[tuple[str, str], list[tuple[str, ...]]] = {
         (T, MI, M4, M4, VI, VI, MI, V, V, V, "boolean", T, M, M)
     ],
     ("processing.track.appearance_ratio", "_appearance_at"): [(M4, M, M4, VI, V, V, F8, M)],
-    ("processing.contact.physics.steps_cpu", "roll_rows"): [ROLL, (*ROLL[:5], f"{F8}[:,:]", *ROLL[6:])],
+    ("processing.contact.physics.steps_cpu", "roll_rows"): [ROLL],
     ("processing.contact.physics.solver_cpu", "solve_rows"): [(T, M, F8, M, F8, I8, F8, I8)],
     ("processing.field.fuse", "_integrate"): [
         (T4, T4, T4, T4, Q4, I8, V4, F4, F4, M4, M4, M4, T4, MB, "uint8[:,:,:]", MB)

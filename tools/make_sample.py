@@ -12,9 +12,10 @@ import sys
 import tempfile
 from pathlib import Path
 
-from acquisition.synthetic.folder import write_session
+from synthetic.folder import write_session
+from synthetic.presets import SAMPLE, SAMPLE_TOSSES
+
 from acquisition.synthetic.lab import Lab
-from acquisition.synthetic.presets import SAMPLE, SAMPLE_TOSSES
 from recordings.errors import TosslabError
 from recordings.importers.folder import import_folder
 from recordings.progress import Console

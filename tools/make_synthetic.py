@@ -11,9 +11,10 @@ import argparse
 import sys
 from pathlib import Path
 
-from acquisition.synthetic.folder import write_session
+from synthetic.folder import write_session
+from synthetic.presets import described, preset
+
 from acquisition.synthetic.lab import Lab
-from acquisition.synthetic.presets import described, preset
 from recordings.errors import TosslabError
 from recordings.progress import Console
 

@@ -29,6 +29,8 @@ SAMPLES = 300
 REACH_RAD = 0.6
 """The sampled tree grows by steps of this length at most."""
 SHORTCUTS = 40
+STANDING_RAD, STAND_S = 1e-6, 0.1
+"""Where the arm is at its goal already, the motion is to stand there for this long."""
 Pose = Float[Array, " j"]
 
 
@@ -134,10 +136,10 @@ def _sampled(model: ArmModel, space: Space, start: Pose, goal: Pose) -> list[Pos
     trees: list[tuple[list[Pose], list[int]]] = [([start], [-1]), ([goal], [-1])]
     for k in range(SAMPLES):
         one, other = trees[k % 2], trees[1 - k % 2]
-        new = _grow(model, space, one, rng.uniform(low, high))
+        new = _extend(model, space, one, rng.uniform(low, high))
         if new is None:
             continue
-        while (near := _grow(model, space, other, one[0][new])) is not None:
+        while (near := _extend(model, space, other, one[0][new])) is not None:
             if np.array_equal(other[0][near], one[0][new]):
                 halves = [_branch(*one, new), _branch(*other, near)]
                 first, second = halves if k % 2 == 0 else halves[::-1]
@@ -145,7 +147,7 @@ def _sampled(model: ArmModel, space: Space, start: Pose, goal: Pose) -> list[Pos
     return None
 
 
-def _grow(model: ArmModel, space: Space, tree: tuple[list[Pose], list[int]], towards: Pose) -> int | None:
+def _extend(model: ArmModel, space: Space, tree: tuple[list[Pose], list[int]], towards: Pose) -> int | None:
     """A step from the tree's nearest pose; the new pose's number, or None where it is not clear."""
     poses, parents = tree
     nearest = int(np.linalg.norm(np.array(poses) - towards, axis=1).argmin())
@@ -182,6 +184,8 @@ def _shortened(model: ArmModel, space: Space, way: list[Pose]) -> list[Pose]:
 
 def _leg(model: ArmModel, a: Pose, b: Pose) -> Samples:
     still = np.zeros(model.joints)
+    if np.abs(b - a).max() < STANDING_RAD:
+        return Samples(np.array([0.0, STAND_S]), np.stack([a, b]), np.stack([still, still]), np.stack([still, still]))
     part = limited_motion(model, (a, still), (b, still), SHARE_OF_SPEED, GENTLE)
     if part is None:
         raise PathRefused(f"no motion of the {model.name} to the start of the toss; move it there by hand")

@@ -121,11 +121,11 @@ def hardware_stamp(clock: str, values: Mapping[str, int], exposure: float) -> tu
     sensor_us, end_us = values.get("sensor_timestamp"), values.get("frame_timestamp")
     if sensor_us is None:
         return None
-    told_s = 0.0 if end_us is None else ((end_us - sensor_us) % WRAP) * 1e-6
-    if end_us is None or math.isnan(exposure) or abs(told_s - exposure / 2) <= STAMP_TOLERANCE_S:
+    reported_s = 0.0 if end_us is None else ((end_us - sensor_us) % WRAP) * 1e-6
+    if end_us is None or math.isnan(exposure) or abs(reported_s - exposure / 2) <= STAMP_TOLERANCE_S:
         return Stamp(clock, sensor_us % WRAP, 1000, WRAP), ""
-    odd = (
-        f"the sensor timestamp lies {1e3 * told_s:.3f} ms before the frame's, half the exposure is "
+    contradiction = (
+        f"the sensor timestamp lies {1e3 * reported_s:.3f} ms before the frame's, half the exposure is "
         f"{5e2 * exposure:.3f} ms: mid-exposure is taken from the frame timestamp and the exposure"
     )
-    return Stamp(clock, end_us % WRAP, 1000, WRAP, "exposure_end"), odd
+    return Stamp(clock, end_us % WRAP, 1000, WRAP, "exposure_end"), contradiction

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,6 +9,7 @@ from typing import Any
 from acquisition.devices import DeviceRefused
 from acquisition.drivers import realsense_parts as parts
 from acquisition.drivers import usb
+from recordings.bounded.documents import read_json
 from recordings.errors import BadInput, DeviceNotFound
 
 ROLLING = {"D415": "colour and depth", "D435": "colour", "D405": "colour and depth", "D410": "depth"}
@@ -126,10 +126,7 @@ def _expose(sensor: Any, option: Any, exposure_s: float | None, unit_s: float) -
 
 def _load_json(rs: Any, device: Any, path: Path) -> None:
     try:
-        text = path.read_text()
-        json.loads(text)
-    except (OSError, ValueError) as error:
-        raise BadInput(
-            f"{path} is no JSON file of camera settings ({error}); save one with realsense-viewer"
-        ) from error
-    rs.rs400_advanced_mode(device).load_json(text)
+        read_json(path)
+    except BadInput as error:
+        raise BadInput(f"{error}: no file of camera settings; save one with realsense-viewer") from error
+    rs.rs400_advanced_mode(device).load_json(path.read_text())

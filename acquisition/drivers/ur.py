@@ -12,6 +12,9 @@ import json
 from importlib import metadata
 from typing import Any
 
+from jaxtyping import Float
+from numpy import ndarray as Array
+
 from acquisition.devices import DeviceRefused
 from acquisition.drivers.workers.arm import WorkerArm
 from recordings.errors import DeviceNotFound
@@ -66,6 +69,14 @@ class UrArm(WorkerArm):
         """Safety mode and remote control, asked of the controller now."""
         answer = self.ask_worker({"do": "check"})
         return "its controller did not say whether it may move; check the network" if answer is None else answer
+
+    def set_load(self, mass_kg: float, centre_flange_m: Float[Array, "3"], radius_m: float) -> None:
+        """What the hand holds, added to the payload that the controller had when the arm was opened (the gripper's, set
+        at the panel). It asks for no inertia, so `radius_m` is not said. Raises DeviceRefused where the controller does
+        not take it, and during a motion."""
+        answer = self.ask_worker({"do": "load", "mass": mass_kg, "centre": centre_flange_m.tolist()})
+        if answer != "":
+            raise DeviceRefused(f"{self.name}: the load of {mass_kg:g} kg was not taken: {answer or 'no answer'}")
 
     def describe(self) -> dict[str, Any]:
         return {

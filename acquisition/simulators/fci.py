@@ -89,8 +89,8 @@ class FciServer(Faulty):
         """Counts, mode and joints; `stretched_s` is by how much the simulator itself was too slow."""
         with self._lock:
             joints = {"q": self.body.q.tolist(), "q_d": self.body.q_d.tolist()}
-            told = {request.name.lower(): numbers for request, numbers in self._set.items()}
-            own = {**told, "mode": self.mode.name, "stretched_s": self._stretched_s, **self._counts, **joints}
+            settings = {request.name.lower(): numbers for request, numbers in self._set.items()}
+            own = {**settings, "mode": self.mode.name, "stretched_s": self._stretched_s, **self._counts, **joints}
         return own | {"gripper": self._gripper.snapshot()}
 
     def close(self) -> None:

@@ -170,7 +170,7 @@ class _Device:
     def _send(self, stream: str, pixels: Array, number: int, at_us: int, frame: SoftwareFrame) -> None:
         sensor, profile, pixel_bytes = self._streams[stream]
         if frame.metadata:
-            self._tell(sensor, stream, number, at_us, frame.exposure_us)
+            self._set_metadata(sensor, stream, number, at_us, frame.exposure_us)
         image = self._rs.software_video_frame()
         image.pixels = np.ascontiguousarray(pixels)
         image.stride, image.bpp = pixels.shape[1] * pixel_bytes, pixel_bytes
@@ -182,7 +182,7 @@ class _Device:
             image.depth_units = 0.001
         sensor.on_video_frame(image)
 
-    def _tell(self, sensor: Any, stream: str, number: int, at_us: int, exposure_us: int) -> None:
+    def _set_metadata(self, sensor: Any, stream: str, number: int, at_us: int, exposure_us: int) -> None:
         keys = self._rs.frame_metadata_value
         unit_us = COLOR_EXPOSURE_UNIT_US if stream == "color" else 1
         for key, value in (

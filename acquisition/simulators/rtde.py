@@ -80,6 +80,7 @@ class UrServer(Faulty):
                 "safety": body.safety.name,
                 "script_running": body.script_running,
                 "moves": body.moves,
+                "payload": list(body.payload),
                 "ticks": self._ticks,
                 "stretched_s": self._stretched_s,
                 **self._counts,
@@ -140,6 +141,8 @@ class UrServer(Faulty):
             "speed_scaling": 1.0,
             "target_speed_fraction": 1.0,
             "output_int_register_0": body.answer,
+            "payload": body.payload[0],
+            "payload_cog": body.payload[1:],
         }
 
     # --- RTDE --------------------------------------------------------------------------------------------------

@@ -18,6 +18,9 @@ TICK_S = 2e-3
 READY_RAD = (0.0, -1.5708, 1.5708, -1.5708, -1.5708, 0.0)
 DQ_MAX_RAD_S = np.pi
 BRAKE_RAD_S2 = 10.0
+MOST_PAYLOAD_KG = 5.0
+GRIPPER = (1.0, 0.0, 0.0, 0.06)
+"""The payload that was set at the panel: mass (kg) and centre of mass (m, in the flange's frame)."""
 
 
 class UrBody:
@@ -32,6 +35,7 @@ class UrBody:
         self.script_running = False
         self.answer = 0
         self.moves = 0
+        self.payload = list(GRIPPER)
         self._command = 0
         self._servo: tuple[Float[Array, "6"], float] | None = None
         self._move: _Move | None = None
@@ -89,7 +93,11 @@ class UrBody:
             self._move.reported = registers.get("input_int_register_1", 0) == 1  # asynchronous: done is told at once
             self.answer = wire.DONE if self._move.reported else 0
             self.moves += 1
+        elif command == wire.Command.SET_PAYLOAD and not 0 <= numbers[0] <= MOST_PAYLOAD_KG:
+            self.end_script()  # set_payload raises, which ends the program
         else:
+            if command == wire.Command.SET_PAYLOAD:
+                self.payload = numbers[:4]
             if command in (wire.Command.SERVO_STOP, wire.Command.STOP_J):
                 self._servo = self._move = None
             self.answer = wire.DONE

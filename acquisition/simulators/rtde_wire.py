@@ -31,6 +31,7 @@ class Command(IntEnum):
     MOVE_J = 1
     SERVO_J = 11
     SERVO_STOP = 16
+    SET_PAYLOAD = 17
     STOP_J = 34
     STOP_SCRIPT = 255
 

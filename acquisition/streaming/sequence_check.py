@@ -59,11 +59,11 @@ class SequenceCheck:
         last = self._number
         if last is not None and image.number <= last and last - image.number < RESTARTED_AFTER:
             cause: Cause = "duplicate" if image.number == last else "out of order"
-            self._tell(image, cause, f"frame {image.number} came after {last}")
+            self._report(image, cause, f"frame {image.number} came after {last}")
             return cause
         if last is not None and image.number > last + 1:
             self.counter.missed(image.number - last - 1)
-            self._tell(image, "gap", f"{image.number - last - 1} frames are missing before {image.number}")
+            self._report(image, "gap", f"{image.number - last - 1} frames are missing before {image.number}")
         elif last is not None:
             self._watch_trigger(image)
         self._number, self._ticks = image.number, image.stamp.ticks
@@ -78,13 +78,13 @@ class SequenceCheck:
         missing = round(passed_ns / self.period_ns) - 1
         if 0 < missing < LONGEST_GAP_FRAMES and abs(passed_ns / self.period_ns - missing - 1) < 0.25:
             self.counter.missed(missing)
-            self._tell(image, "trigger", f"{missing} triggers were lost before {image.number}")
+            self._report(image, "trigger", f"{missing} triggers were lost before {image.number}")
 
     def _shaped(self, image: Image) -> Cause | None:
         if self._shape is None:
             self._shape = image.pixels.shape
         if image.pixels.shape != self._shape:
-            self._tell(image, "invalid", f"an image of {image.pixels.shape} after {self._shape}", "error")
+            self._report(image, "invalid", f"an image of {image.pixels.shape} after {self._shape}", "error")
             return "invalid"
         return None
 
@@ -93,9 +93,9 @@ class SequenceCheck:
         self._alike = self._alike + 1 if digest == self._digest else 0
         self._digest = digest
         if self._alike == FROZEN_AFTER:
-            self._tell(image, "frozen", f"the same picture {FROZEN_AFTER + 1} times in a row", "error")
+            self._report(image, "frozen", f"the same picture {FROZEN_AFTER + 1} times in a row", "error")
 
-    def _tell(self, image: Image, kind: str, text: str, level: Level = "warning") -> None:
+    def _report(self, image: Image, kind: str, text: str, level: Level = "warning") -> None:
         self.troubles.append(Trouble(image.host_ns, self.topic, kind, text, level))
 
     def new_troubles(self) -> list[Trouble]:

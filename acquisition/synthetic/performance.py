@@ -66,9 +66,10 @@ def perform(lab: Lab, motion: Motion, fps: float, progress: Progress | None = No
     for number, view in enumerate(lab.mono_views):
         times_s = np.arange(count) / fps + lab.mono_config.trigger_delay_s
         streams[view.camera.frame] = (times_s, partial(_mono, lab, motion, number))
-    tell = _Steps(progress or Silent(), len(streams) * (count + 2 * VARIANTS))
+    steps = _Steps(progress or Silent(), len(streams) * (count + 2 * VARIANTS))
     reels = {
-        name: _reel(times_s, motion.instants.end_s, tell.counted(name, see)) for name, (times_s, see) in streams.items()
+        name: _reel(times_s, motion.instants.end_s, steps.counted(name, see))
+        for name, (times_s, see) in streams.items()
     }
     return Performance(motion, reels)
 

@@ -45,26 +45,6 @@ def draw_release(config: SceneConfig, radius_m: float, rng: np.random.Generator)
     )
 
 
-def brightness_over_time(config: SceneConfig, toss: int, times_s: Float[Array, " n"]) -> Float[Array, " n"]:
-    """Brightness of each frame against the first exposure setting: slow waves, `drift` at the most."""
-    rng = generator(config.seed, COLOR, toss)
-    wave = np.zeros_like(times_s)
-    for shortest_s, longest_s in ((1.0, 2.5), (0.6, 1.2)):
-        wave += np.sin(2 * np.pi * times_s / rng.uniform(shortest_s, longest_s) + rng.uniform(0, 2 * np.pi))
-    return 1 + config.color.drift * wave / max(float(np.abs(wave).max()), 1e-9)
-
-
-def frame_times(config: SceneConfig, toss: int, end_s: float) -> tuple[Float[Array, " n"], list[int], list[int]]:
-    """Mid-exposure times of the nominal grid with jitter (the first is 0), which frames are kept, which dropped."""
-    rng = generator(config.seed, TIMES, toss)
-    count = int(end_s * config.camera.fps) + 1
-    times = np.arange(count) / config.camera.fps + config.camera.time_jitter_s * rng.standard_normal(count)
-    times[0] = 0.0
-    lost = rng.random(count) < config.camera.dropped_share
-    lost[[0, -1]] = False
-    return times, np.flatnonzero(~lost).tolist(), np.flatnonzero(lost).tolist()
-
-
 def small_error(frame: str, length_m: float, angle_deg: float, rng: np.random.Generator) -> Transform:
     """A shift and a turn of exactly these sizes in random directions."""
     shift, axis = _unit(rng.standard_normal(3)), _unit(rng.standard_normal(3))

@@ -146,12 +146,12 @@ class _Setup:
         camera_from_rig = connected(self.names, poses)
         rig_from_body = np.tile(np.eye(4), (self.count + 1, 1, 1))
         known = np.zeros(self.count + 1, dtype=bool)
-        looks = [*({n: (self.views[n][v], poses[n][v]) for n in self.names} for v in range(self.count))]
-        looks.append({n: (v, board_pose(self.models[n], v)) for n, v in self.still.items()})
-        for view, look in enumerate(looks):
-            sights = [(len(seen), n, candidates) for n, (seen, candidates) in look.items() if candidates]
-            if sights:
-                _, n, candidates = max(sights, key=lambda s: s[0])
+        instants = [*({n: (self.views[n][v], poses[n][v]) for n in self.names} for v in range(self.count))]
+        instants.append({n: (v, board_pose(self.models[n], v)) for n, v in self.still.items()})
+        for view, seen_by in enumerate(instants):
+            usable = [(len(seen), n, candidates) for n, (seen, candidates) in seen_by.items() if candidates]
+            if usable:
+                _, n, candidates = max(usable, key=lambda s: s[0])
                 rig_from_body[view] = inverse_poses(camera_from_rig[self.names.index(n)]) @ candidates[0]
                 known[view] = True
         cameras, pieces = len(self.names), np.zeros(2, dtype=bool)
@@ -201,17 +201,17 @@ class _Setup:
         )
 
 
-def still_view(looks: Sequence[TargetView]) -> TargetView | None:
+def still_view(instants: Sequence[TargetView]) -> TargetView | None:
     """What all images of a camera show of something that stands still, as one view: each point's median place, as sure
     as in one image (the same pixels err alike in every image). None where nothing is seen in half of them."""
-    looks = [view for view in looks if len(view)]
-    if not looks:
+    instants = [view for view in instants if len(view)]
+    if not instants:
         return None
-    ids = np.concatenate([v.ids for v in looks])
+    ids = np.concatenate([v.ids for v in instants])
     points, pixels, covariance = (
-        np.concatenate([getattr(v, part) for v in looks]) for part in ("points_m", "pixels", "covariance_px2")
+        np.concatenate([getattr(v, part) for v in instants]) for part in ("points_m", "pixels", "covariance_px2")
     )
-    known = [i for i in np.unique(ids).tolist() if (ids == i).sum() >= 0.5 * len(looks)]
+    known = [i for i in np.unique(ids).tolist() if (ids == i).sum() >= 0.5 * len(instants)]
     if not known:
         return None
     rows = [ids == i for i in known]

@@ -92,11 +92,11 @@ def connected(
     while len(found) < len(names):
         best: tuple[int, str, Array] | None = None
         for here, there in ((a, b) for a in found for b in names if b not in found):
-            looks = [
+            relative = [
                 [there_pose @ inverse_poses(here_pose) for there_pose in q for here_pose in p]
                 for p, q in zip(poses[here], poses[there])
             ]
-            agreed = most_agreed([look for look in looks if look], 5.0, 0.05)
+            agreed = most_agreed([poses for poses in relative if poses], 5.0, 0.05)
             if agreed is not None and (best is None or agreed[1] > best[0]):
                 best = (agreed[1], there, agreed[0] @ found[here])
         if best is None or best[0] < LEAST_SHARED:

@@ -47,10 +47,10 @@ def mean_pose(poses: Sequence[Float[Array, "4 4"]], keep: float = 0.7) -> Float[
 
 def _most_central(stack: Float[Array, "n 4 4"]) -> int:
     turns, places = stack[:, :3, :3], stack[:, :3, 3]
-    apart = np.linalg.norm(turns[:, None] - turns[None], axis=(2, 3)) + 3 * np.linalg.norm(
+    distance = np.linalg.norm(turns[:, None] - turns[None], axis=(2, 3)) + 3 * np.linalg.norm(
         places[:, None] - places[None], axis=2
     )
-    return int(np.median(apart, axis=1).argmin())
+    return int(np.median(distance, axis=1).argmin())
 
 
 def angle_deg(rotation: Float[Array, "3 3"]) -> float:

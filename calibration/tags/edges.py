@@ -53,23 +53,23 @@ def refine_corners(
 
 
 class _Edges:
-    """The 4 n edges of n squares: middles, unit directions, outward normals, half lengths, reach of the search."""
+    """The 4 n edges of n squares: midpoints, unit directions, outward normals, half lengths, reach of the search."""
 
-    def __init__(self, middle: Array, along: Array, outward: Array, half: Array, reach: Array) -> None:
-        self.middle, self.along, self.outward, self.half, self.reach = middle, along, outward, half, reach
+    def __init__(self, midpoint: Array, along: Array, outward: Array, half: Array, reach: Array) -> None:
+        self.midpoint, self.along, self.outward, self.half, self.reach = midpoint, along, outward, half, reach
 
     @staticmethod
     def around(corners_px: Float[Array, "n 4 2"], cells: int) -> _Edges:
         start, end = corners_px.reshape(-1, 2), np.roll(corners_px, -1, axis=1).reshape(-1, 2)
-        middle, run = (start + end) / 2, end - start
+        midpoint, run = (start + end) / 2, end - start
         half = np.linalg.norm(run, axis=1) / 2
         along = run / (2 * half[:, None])
         outward = np.stack([along[:, 1], -along[:, 0]], -1)
         center = np.repeat(corners_px.mean(axis=1), 4, axis=0)
-        outward *= np.sign(np.einsum("ij,ij->i", outward, middle - center))[:, None]
-        width = np.abs(np.einsum("ij,ij->i", outward, middle - center)) * 2
+        outward *= np.sign(np.einsum("ij,ij->i", outward, midpoint - center))[:, None]
+        width = np.abs(np.einsum("ij,ij->i", outward, midpoint - center)) * 2
         reach = np.clip(0.7 * width / cells, SMALLEST_REACH_PX, LARGEST_REACH_PX)
-        return _Edges(middle, along, outward, half, reach)
+        return _Edges(midpoint, along, outward, half, reach)
 
 
 def _fit(
@@ -109,7 +109,7 @@ def _sampled(
     image: Float32[Array, "h w"], edges: _Edges, s: Float[Array, " a"], d: Float[Array, "e c"]
 ) -> Float[Array, "e a c"]:
     places = (
-        edges.middle[:, None, None]
+        edges.midpoint[:, None, None]
         + (edges.half[:, None] * s)[:, :, None, None] * edges.along[:, None, None]
         + d[:, None, :, None] * edges.outward[:, None, None]
     ).astype(np.float32)
@@ -154,12 +154,12 @@ def _model(
 def _intersect(
     edges: _Edges, fit: Float[Array, "e 7"], information: Float[Array, "e 7 7"]
 ) -> tuple[Float[Array, "n 4 2"], Float[Array, "n 4 2 2"]]:
-    """Corner k is where edge k - 1 and edge k meet: n . x = n . middle + a + b (t . (x - middle)) / half for both."""
+    """Corner k is where edges k - 1 and k meet: n . x = n . m + a + b (t . (x - m)) / half for both, m: midpoint."""
     covariance = np.linalg.pinv(information, hermitian=True)[:, :2, :2]
     n = len(fit) // 4
     slope = fit[:, 1] / edges.half
     normal = edges.outward - slope[:, None] * edges.along
-    offset = np.einsum("ij,ij->i", normal, edges.middle) + fit[:, 0]
+    offset = np.einsum("ij,ij->i", normal, edges.midpoint) + fit[:, 0]
     k = np.arange(4 * n).reshape(n, 4)
     before = np.roll(k, 1, axis=1)
     matrix = np.stack([normal[before], normal[k]], axis=-2)

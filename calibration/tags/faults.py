@@ -52,13 +52,13 @@ def _listed(ids: Sequence[int]) -> str:
 def sizes_by_triangulation(
     models: Mapping[str, CameraModel],
     camera_from_rig: Mapping[str, Float[Array, "4 4"]],
-    sightings: Mapping[str, Sequence[Sequence[TagDetection]]],
+    detections: Mapping[str, Sequence[Sequence[TagDetection]]],
 ) -> dict[int, tuple[float, int]]:
     """Side of each tag in m by calibrated cameras that see it at the same instant (median over sides and instants), and
     how many sights that is."""
     sides: dict[int, list[float]] = {}
-    for a, b in combinations([n for n in models if n in camera_from_rig and n in sightings], 2):
-        for tags_a, tags_b in zip(sightings[a], sightings[b]):
+    for a, b in combinations([n for n in models if n in camera_from_rig and n in detections], 2):
+        for tags_a, tags_b in zip(detections[a], detections[b]):
             other = {t.tag_id: t for t in tags_b}
             for tag in tags_a:
                 if tag.tag_id in other:

@@ -1,10 +1,10 @@
 """A rigid body with tags whose layout is not known, seen by calibrated or uncalibrated cameras: layout, poses, cameras.
 
-    solved = solve_tagged_object(models, sightings, size_m, camera_from_rig)
+    solved = solve_tagged_object(models, detections, size_m, camera_from_rig)
 
 Tags that are seen together give their relative pose (of each tag's two possible poses the pair that many images agree
-on); from the layout grown in that way follow the body's poses, from these the cameras where they are not known, and one
-bundle adjustment settles everything.
+on), and the layout tag by tag. From it follow the body's poses, from these the cameras where they are not known; one
+bundle adjustment refines everything.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ from recordings.errors import BadInput
 from recordings.geometry import CameraModel
 
 Candidates = list[Float[Array, "4 4"]]
-LEAST_LOOKS = 3
+LEAST_VIEWS = 3
 WRONG_TAG_PX = 4.0
-"""Sightings that fit no better than this are left out and counted."""
+"""Detections that fit no better than this are left out and counted."""
 
 
 @dataclass(frozen=True, eq=False)
 class TaggedObject:
     """`tag_ids[g]` is piece g of `solved.scene` (its first one is the body's frame); view k is instant `instants[k]`.
 
-    `left_out`: sightings that fit no pose. `undetermined_tags`: seen, but never together with the others.
+    `left_out`: detections that fit no pose. `undetermined_tags`: seen, but never together with the others.
     """
 
     cameras: tuple[str, ...]
@@ -51,20 +51,22 @@ class TaggedObject:
 
 def solve_tagged_object(
     models: Mapping[str, CameraModel],
-    sightings: Mapping[str, Sequence[Sequence[TagDetection]]],
+    detections: Mapping[str, Sequence[Sequence[TagDetection]]],
     size_m: Mapping[int, float],
     camera_from_rig: Mapping[str, Float[Array, "4 4"]] | None = None,
 ) -> TaggedObject:
-    """`sightings[camera][k]`: the body's tags at instant k (all cameras exposed together). `size_m` by tag id.
+    """`detections[camera][k]`: the body's tags at instant k (all cameras exposed together). `size_m` by tag id.
 
     Without `camera_from_rig` the first camera by name is the rig and the others are solved too. Raises BadInput where
     nothing can be solved.
     """
     names = sorted(models)
-    looks = {n: [_candidates(models[n], tags, size_m) for tags in sightings[n]] for n in names}
-    layout, undetermined = _grown_layout([look for n in names for look in looks[n]])
+    candidates = {n: [_candidates(models[n], tags, size_m) for tags in detections[n]] for n in names}
+    layout, undetermined = _layout_tag_by_tag([of_view for n in names for of_view in candidates[n]])
     poses = {
-        n: [_body_poses(models[n], look, tags, layout, size_m) for look, tags in zip(looks[n], sightings[n])]
+        n: [
+            _body_poses(models[n], of_view, tags, layout, size_m) for of_view, tags in zip(candidates[n], detections[n])
+        ]
         for n in names
     }
     fixed = camera_from_rig is not None
@@ -83,8 +85,8 @@ def solve_tagged_object(
         np.ones(len(ids)),
         np.zeros(len(ids), dtype=bool),
     )
-    seen = _observations(names, ids, sightings, size_m, known)
-    solved, seen, left_out = _settled(scene, seen)
+    seen = _observations(names, ids, detections, size_m, known)
+    solved, seen, left_out = _without_outliers(scene, seen)
     instants = np.flatnonzero(solved.scene.free_views)
     return TaggedObject(
         tuple(names),
@@ -111,13 +113,13 @@ def _candidates(model: CameraModel, tags: Sequence[TagDetection], size_m: Mappin
     return out
 
 
-def _grown_layout(
-    looks: Sequence[Mapping[int, Candidates]],
+def _layout_tag_by_tag(
+    candidates: Sequence[Mapping[int, Candidates]],
 ) -> tuple[dict[int, Float[Array, "4 4"]], tuple[int, ...]]:
     """body_from_tag, the body being the tag seen most often; and the tags that nothing connects to it."""
     counts: dict[int, int] = {}
-    for look in looks:
-        for tag in look:
+    for of_view in candidates:
+        for tag in of_view:
             counts[tag] = counts.get(tag, 0) + 1
     if not counts:
         raise BadInput(
@@ -129,39 +131,39 @@ def _grown_layout(
         for new in counts:
             if new in layout:
                 continue
-            relative = [_relative(look, layout, new) for look in looks if new in look]
+            relative = [_relative(of_view, layout, new) for of_view in candidates if new in of_view]
             agreed = most_agreed([r for r in relative if r], 6.0, 0.012)
             if agreed is not None and (best is None or agreed[1] > best[0]):
                 best = (agreed[1], new, agreed[0])
-        if best is None or best[0] < LEAST_LOOKS:
+        if best is None or best[0] < LEAST_VIEWS:
             return layout, tuple(sorted(set(counts) - set(layout)))
         layout[best[1]] = best[2]
 
 
-def _relative(look: Mapping[int, Candidates], layout: Mapping[int, Array], new: int) -> Candidates:
+def _relative(of_view: Mapping[int, Candidates], layout: Mapping[int, Array], new: int) -> Candidates:
     """body_from_new as one image has it, by every tag already placed."""
     out = []
     for old, place in layout.items():
-        for camera_from_old in look.get(old, ()):
+        for camera_from_old in of_view.get(old, ()):
             back = place @ inverse_poses(camera_from_old)
-            out += [back @ pose for pose in look[new]]
+            out += [back @ pose for pose in of_view[new]]
     return out
 
 
 def _body_poses(
     model: CameraModel,
-    look: Mapping[int, Candidates],
+    of_view: Mapping[int, Candidates],
     tags: Sequence[TagDetection],
     layout: Mapping[int, Array],
     size_m: Mapping[int, float],
 ) -> Candidates:
     """camera_from_body of one image: of all tags' candidates those that explain all tags seen about best."""
-    mine = [t for t in tags if t.tag_id in layout and t.tag_id in look]
+    mine = [t for t in tags if t.tag_id in layout and t.tag_id in of_view]
     if not mine:
         return []
     points = np.concatenate([_corners_m(layout[t.tag_id], size_m[t.tag_id]) for t in mine])
     pixels = np.concatenate([t.corners_px for t in mine])
-    tried = [pose @ inverse_poses(layout[t.tag_id]) for t in mine for pose in look[t.tag_id]]
+    tried = [pose @ inverse_poses(layout[t.tag_id]) for t in mine for pose in of_view[t.tag_id]]
     errors = np.array([rms_px(model, pose, points, pixels) for pose in tried])
     errors = np.where(np.isfinite(errors), errors, np.inf)
     limit = 2 * errors.min() + 0.5
@@ -190,14 +192,14 @@ def _views(
 def _observations(
     names: Sequence[str],
     ids: Sequence[int],
-    sightings: Mapping[str, Sequence[Sequence[TagDetection]]],
+    detections: Mapping[str, Sequence[Sequence[TagDetection]]],
     size_m: Mapping[int, float],
     known: Array,
 ) -> Observations:
     rows = [
         (c, k, ids.index(tag.tag_id), tag)
         for c, n in enumerate(names)
-        for k, tags in enumerate(sightings[n])
+        for k, tags in enumerate(detections[n])
         for tag in tags
         if tag.tag_id in ids and known[k]
     ]
@@ -213,8 +215,8 @@ def _observations(
     )
 
 
-def _settled(scene: Scene, seen: Observations) -> tuple[Solved, Observations, int]:
-    """Solve, drop sightings that fit nothing, solve again."""
+def _without_outliers(scene: Scene, seen: Observations) -> tuple[Solved, Observations, int]:
+    """Solve, drop detections that fit nothing, solve again."""
     solved = adjust(scene, seen)
     worst = np.sqrt((solved.residual_px**2).sum(axis=1).reshape(-1, 4).mean(axis=1))
     keep = np.repeat(worst < WRONG_TAG_PX, 4)

@@ -37,19 +37,19 @@ SAME_TRIGGER_NS = 2_000_000
 
 @dataclass(frozen=True, eq=False)
 class SolvedToss:
-    """One toss's tagged object: its course in the D455's frame, stamps of the mono cameras (s)."""
+    """One toss's tagged object: its trajectory in the D455's frame, stamps of the mono cameras (s)."""
 
     tags: TossTags
     body: TaggedObject
-    course: Path3
+    trajectory: Path3
     size_m: Mapping[int, float]
     findings: tuple[Finding, ...]
 
     def centered(self) -> Path3:
-        """The course of the middle of the tags, which is nearer to the centre of mass than one tag is."""
+        """The trajectory of the centre of the tags, which is nearer to the centre of mass than one tag is."""
         middle = np.mean([place[:3, 3] for place in self.body.body_from_tag.values()], axis=0)
-        assert self.course.rotation is not None
-        return replace(self.course, position_m=self.course.position_m + self.course.rotation @ middle)
+        assert self.trajectory.rotation is not None
+        return replace(self.trajectory, position_m=self.trajectory.position_m + self.trajectory.rotation @ middle)
 
 
 def solve_toss(session: Session, number: int, args: argparse.Namespace, progress: Progress) -> SolvedToss:
@@ -64,20 +64,20 @@ def solve_toss(session: Session, number: int, args: argparse.Namespace, progress
     fixed = table_target(session.calibration)
     of_object = tags.of_object(asked, fixed)
     models = {c: session.calibration.cameras[c] for c in places}
-    sightings, times_ns = triggered(tags, of_object, list(places))
-    if not any(t for lists in sightings.values() for t in lists):
+    detections, times_ns = triggered(tags, of_object, list(places))
+    if not any(t for lists in detections.values() for t in lists):
         with session.toss(number) as toss:
             why = explain_absence(grey_images(toss, next(iter(places)))[1], session.calibration.tag_family)
         raise BadInput(f"toss {number}: no tags on the object: {why}")
-    measured = sizes_by_triangulation(models, places, sightings)
+    measured = sizes_by_triangulation(models, places, detections)
     size_m = tag_sizes(args, of_object, measured)
-    body = solve_tagged_object(models, sightings, size_m, places)
+    body = solve_tagged_object(models, detections, size_m, places)
     findings = [*(wrong_sizes(size_m, measured) if args.tag_size else []), *_moved(session, fixed, tags)]
     findings += limit(
         body.solved.rms_px, f"toss {number}: the residual of the object's tags", "px", OBJECT_PX, WORST_OBJECT_PX
     )
-    course = Path3.of_poses(times_ns[body.instants] / 1e9, body.rig_from_body)
-    return SolvedToss(tags, body, course, size_m, tuple(findings))
+    trajectory = Path3.of_poses(times_ns[body.instants] / 1e9, body.rig_from_body)
+    return SolvedToss(tags, body, trajectory, size_m, tuple(findings))
 
 
 def _moved(session: Session, fixed: Tags | None, tags: TossTags) -> list[Finding]:

@@ -289,9 +289,9 @@ def _carry_rest(problem: Problem, initial: Initialisation) -> int:
         keys = [body_key(body, s) for s in problem.stamps]
         known = [k in initial.poses for k in keys]
         for i, key in enumerate(keys):
-            beside = [j for j in (i - 1, i + 1) if 0 <= j < len(keys) and known[j]]
-            if not known[i] and beside:
-                initial.poses[key] = initial.poses[keys[beside[0]]]
+            neighbours = [j for j in (i - 1, i + 1) if 0 <= j < len(keys) and known[j]]
+            if not known[i] and neighbours:
+                initial.poses[key] = initial.poses[keys[neighbours[0]]]
                 placed += 1
     return placed
 

@@ -94,7 +94,7 @@ class FrameToModel:
         progress: Progress,
     ) -> Tracked:
         """Poses `camera_from_object` of all frames, and the fused mesh. The object frame starts parallel to the
-        camera at the middle of the first masked cloud. Raises BadInput where no frame holds enough of the object."""
+        camera at the centroid of the first masked cloud. Raises BadInput where no frame holds enough of the object."""
         s = self._settings
         poses = np.full((len(frames), 4, 4), np.nan)
         covariance = np.full((len(frames), 6, 6), np.nan)
@@ -145,7 +145,7 @@ class _Motion:
         self._center_m = view.center_m
 
     def starts(self, view: _View) -> list[Float[Array, "4 4"]]:
-        """Constant spin, then no spin; the shift of the visible cloud's middle in both."""
+        """Constant spin, then no spin; the shift of the visible cloud's centroid in both."""
         last = self._poses[-1]
         still = last.copy()
         still[:3, 3] += view.center_m - self._center_m
@@ -259,7 +259,7 @@ def _ordered_faces(faces: Int[Array, "f 3"]) -> Int[Array, "f 3"]:
 
 
 def _start_pose(view: _View) -> Float[Array, "4 4"]:
-    """Parallel to the camera, origin at the middle of the visible cloud."""
+    """Parallel to the camera, origin at the centroid of the visible cloud."""
     pose = np.eye(4)
     pose[:3, 3] = view.points_m.mean(0)
     return pose

@@ -85,8 +85,8 @@ class Field:
         r, s = self._readings, self._surface
         near = _nearness(points_m, r.point_m, s, self._sizes, self._config)
         pull = (near * self._alpha) @ r.direction
-        reach = ((r.point_m - s.middle_m) * r.direction).sum(1) @ self._alpha
-        return pull + self._sizes.scale**2 * reach * (points_m - s.middle_m)
+        reach = ((r.point_m - s.center_m) * r.direction).sum(1) @ self._alpha
+        return pull + self._sizes.scale**2 * reach * (points_m - s.center_m)
 
 
 class Surface:
@@ -94,7 +94,7 @@ class Surface:
 
     def __init__(self, vertices_m: Float[Array, "v 3"], observed: Bool[Array, " v"] | None, most: int = 4000) -> None:
         kept = np.random.default_rng(0).permutation(len(vertices_m))[:most]
-        self.middle_m = 0.5 * (vertices_m.min(0) + vertices_m.max(0))
+        self.center_m = 0.5 * (vertices_m.min(0) + vertices_m.max(0))
         self.extent_m = float(np.ptp(vertices_m, axis=0).mean())
         self._unseen = np.zeros(len(kept)) if observed is None else (~observed[kept]).astype(np.float64)
         self._tree = cKDTree(vertices_m[kept])
@@ -124,7 +124,7 @@ def _covariances(
 ) -> tuple[Float[Array, "j j"], Float[Array, "j j"]]:
     """Of the field along the readings' directions, and of the readings' own errors."""
     along = readings.direction @ readings.direction.T
-    reach = ((readings.point_m - surface.middle_m) * readings.direction).sum(1)
+    reach = ((readings.point_m - surface.center_m) * readings.direction).sum(1)
     K = along * _nearness(readings.point_m, readings.point_m, surface, sizes, config)
     K = K + sizes.scale**2 * np.outer(reach, reach)
     noise = np.diag(readings.sigma_m**2 + config.contact_m**2) + plane_m**2

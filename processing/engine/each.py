@@ -15,7 +15,7 @@ from concurrent.futures import Future
 from dataclasses import dataclass, field
 from typing import Protocol, TypeVar, runtime_checkable
 
-from processing.engine.outcome import Lost, Outcome, raise_if_told
+from processing.engine.outcome import Lost, Outcome, raise_outcome
 from recordings.progress import Board
 
 Item = TypeVar("Item", bound=Hashable)
@@ -99,7 +99,7 @@ class SideBySide:
     """An engine with slots. Used as a context: what still runs at its end (Ctrl-C) is stopped and cleared away."""
 
     def __init__(self, slots: Sequence[Slot], board: Board) -> None:
-        self._lanes, self._board = slots, board
+        self._slots, self._board = slots, board
         self._threads: list[threading.Thread] = []
         self._waiting: deque[_Asked] = deque()
         self._asked: dict[str, _Asked] = {}
@@ -116,7 +116,7 @@ class SideBySide:
             for asked in self._waiting:
                 asked.done.set_exception(Stopped())
             self._changed.notify_all()
-        for slot in self._lanes:
+        for slot in self._slots:
             slot.stop()
         for thread in self._threads:
             thread.join(ENDS_WITHIN_S)
@@ -154,8 +154,8 @@ class SideBySide:
 
     def _begin(self) -> None:
         """As many threads as there is work for, each with a slot of its own."""
-        if len(self._threads) < min(len(self._lanes), len(self._asked)):
-            slot = self._lanes[len(self._threads)]
+        if len(self._threads) < min(len(self._slots), len(self._asked)):
+            slot = self._slots[len(self._threads)]
             self._threads.append(threading.Thread(target=self._serve, args=(slot,), daemon=True))
             self._threads[-1].start()
 
@@ -164,7 +164,7 @@ class SideBySide:
             try:
                 if asked.group is not None and asked.group.stopped():
                     raise Stopped
-                raise_if_told(self._performed(slot, asked.task))
+                raise_outcome(self._performed(slot, asked.task))
             except BaseException as wrong:
                 self._ended(asked)
                 asked.done.set_exception(wrong)

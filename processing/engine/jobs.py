@@ -24,8 +24,8 @@ def cores() -> int:
 
 def free_gb() -> float | None:
     """Memory that is free, or freed when asked for (GiB); None where the system does not tell."""
-    told = dict(line.split(":", 1) for line in _text(Path("/proc/meminfo")).splitlines() if ":" in line)
-    free = [float(told["MemAvailable"].split()[0]) * 1024] if "MemAvailable" in told else []
+    fields = dict(line.split(":", 1) for line in _text(Path("/proc/meminfo")).splitlines() if ":" in line)
+    free = [float(fields["MemAvailable"].split()[0]) * 1024] if "MemAvailable" in fields else []
     most, used = _words(CGROUP / "memory.max"), _words(CGROUP / "memory.current")
     if most and used and most[0] != "max":
         free.append(float(most[0]) - float(used[0]))

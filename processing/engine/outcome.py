@@ -30,16 +30,16 @@ def outcome_of(call: Callable[[], object]) -> Outcome:
     try:
         call()
     except Exception as wrong:
-        told: Outcome = {"kind": type(wrong).__name__, "message": str(wrong), "trace": traceback.format_exc()}
+        outcome: Outcome = {"kind": type(wrong).__name__, "message": str(wrong), "trace": traceback.format_exc()}
         if isinstance(wrong, OSError):
-            told |= {"kind": "OSError", "arguments": [wrong.errno, wrong.strerror, wrong.filename]}
+            outcome |= {"kind": "OSError", "arguments": [wrong.errno, wrong.strerror, wrong.filename]}
         if isinstance(wrong, ImportError):
-            told |= {"kind": "ImportError"}
-        return told
+            outcome |= {"kind": "ImportError"}
+        return outcome
     return {}
 
 
-def raise_if_told(outcome: Outcome) -> None:
+def raise_outcome(outcome: Outcome) -> None:
     """The same error again, in this process."""
     if not outcome:
         return

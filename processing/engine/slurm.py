@@ -83,8 +83,8 @@ class Queue:
             return self._states
         if answer.returncode != 0 and "Invalid job id" not in answer.stderr:
             return self._states
-        told = dict(line.split()[:2] for line in answer.stdout.splitlines() if len(line.split()) >= 2)
-        return {job: told.get(job, "GONE") for job in jobs}
+        states = dict(line.split()[:2] for line in answer.stdout.splitlines() if len(line.split()) >= 2)
+        return {job: states.get(job, "GONE") for job in jobs}
 
 
 class SlurmJob:
@@ -101,7 +101,7 @@ class SlurmJob:
         self._queue.add(job.job_id)
         try:
             self._wait(job, marker)
-            return self._told(task, marker)
+            return self._outcome(task, marker)
         finally:
             self._queue.remove(job.job_id)
 
@@ -128,12 +128,12 @@ class SlurmJob:
                 return
             time.sleep(POLL_S)
 
-    def _told(self, task: Task, marker: Path) -> Outcome:
+    def _outcome(self, task: Task, marker: Path) -> Outcome:
         """What the job told, or its log's last line."""
         if marker.exists():
-            told = read_json(marker)
+            outcome = read_json(marker)
             marker.unlink()
-            return dict(told)
+            return dict(outcome)
         last = ""
         with contextlib.suppress(OSError):
             last = self._job.paths.stderr.read_text(errors="replace").strip()
@@ -145,9 +145,9 @@ class SlurmJob:
 
 def marked(call: Callable[[], object], marker: Path) -> None:
     """In the job's process: the call, then how it ended as the marker, whole or not there."""
-    told = outcome_of(call)
+    outcome = outcome_of(call)
     partial = marker.with_suffix(".partial")
-    partial.write_text(json.dumps(told))
+    partial.write_text(json.dumps(outcome))
     partial.replace(marker)
 
 

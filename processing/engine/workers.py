@@ -23,7 +23,7 @@ from recordings.progress import Board, Progress, Silent
 
 PRELOADED = ["processing.pipeline"]
 """Imported once, in the process that all workers are forked from (where there is such a one)."""
-TOLD_EVERY_S = 0.2
+REPORT_EVERY_S = 0.2
 
 
 class Worker:
@@ -42,10 +42,10 @@ class Worker:
         try:
             pipe.send_bytes(cloudpickle.dumps(task.call))
             while True:
-                told = pipe.recv()
-                if isinstance(told, dict):
-                    return told
-                self._board.step(self, *told)
+                message = pipe.recv()
+                if isinstance(message, dict):
+                    return message
+                self._board.step(self, *message)
         except (EOFError, OSError):
             raise Lost(self._why(task)) from None
         finally:
@@ -134,17 +134,17 @@ def _end_with_parent() -> None:
         os.kill(os.getpid(), signal.SIGTERM)
 
 
-class _Told:
+class _Reporter:
     """A stage's progress in a worker, sent to where all of them are shown."""
 
     def __init__(self, label: str) -> None:
         self._label = label
-        self._told_s = -float("inf")
+        self._reported_s = -float("inf")
 
     def step(self, done: int, total: int, note: str = "") -> None:
         now = time.monotonic()
-        if _to_parent is not None and (now - self._told_s >= TOLD_EVERY_S or done >= total):
-            self._told_s = now
+        if _to_parent is not None and (now - self._reported_s >= REPORT_EVERY_S or done >= total):
+            self._reported_s = now
             _to_parent.send((self._label, done, total, note))
 
     def value(self, name: str, value: float, *, at: int) -> None:
@@ -155,4 +155,4 @@ class Shown:
     """`run.progress` where stages are computed in slots: sent to the board by the process that computes one."""
 
     def __call__(self, label: str) -> Progress:
-        return Silent() if _to_parent is None else _Told(label)
+        return Silent() if _to_parent is None else _Reporter(label)

@@ -3,16 +3,14 @@ it without truth."""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy.stats import t as student
 
 from processing.evaluate.score import Value, rollout_values
 from recordings.results.folder import Results, VariantRecord, read_contact
+from recordings.results.stage_files import stage_document
 
 
 def learned_values(results: Results, record: VariantRecord) -> dict[str, Value]:
@@ -43,7 +41,7 @@ def _learned(stage: Path) -> dict[str, tuple[float, float, float]]:
     """Value, lower and upper bound by name, of one stage `contact`."""
     model = read_contact(stage)
     found = {"friction": (model.friction, model.friction_low, model.friction_high)}
-    document = json.loads((stage / "result.json").read_text()) if (stage / "result.json").exists() else {}
+    document = stage_document(stage / "result.json") if (stage / "result.json").exists() else {}
     rebound = document.get("restitution")
     if isinstance(rebound, dict):
         found["restitution"] = (rebound["value"], rebound["low"], rebound["high"])
@@ -63,5 +61,5 @@ def _rollouts(results: Results, record: VariantRecord) -> dict[str, Value]:
     stage = record.extra.get("rollout")
     if stage is None:
         return {}
-    document: Mapping[str, Any] = json.loads((results.path / stage / "rollout.json").read_text())
+    document = stage_document(results.path / stage / "rollout.json")
     return rollout_values(document["against_track"], "rollout_track", "the estimated track, met at the release")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import json
 from collections.abc import Sequence
 from html import escape
 from typing import TYPE_CHECKING, Any
@@ -24,6 +23,7 @@ from recordings.film.film import STATUS_RGB
 from recordings.film.raster import covered_pixels, outlined
 from recordings.mcap.codec import decode_image
 from recordings.results.folder import Results
+from recordings.results.stage_files import stage_document
 from recordings.session import Session
 from recordings.tracks import ObjectShape
 from recordings.whole_file import write_bytes
@@ -177,7 +177,7 @@ def _rollouts(results: Results, main: Row | None) -> str:
     stage = None if main is None else main.record.extra.get("rollout")
     if main is None or not stage:
         return ""
-    document = json.loads((results.path / stage / "rollout.json").read_text())
+    document = stage_document(results.path / stage / "rollout.json")
     compared = {"estimated track": document["against_track"]}
     if main.score is not None and main.score.rollout is not None:
         compared["truth"] = main.score.rollout

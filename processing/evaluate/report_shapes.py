@@ -65,7 +65,7 @@ class _Drawing:
 
 
 def _drawn(s: Shown, turn: Float[Array, "3 3"], size_m: float) -> _Drawing:
-    """Orthographic, about the middle of the shape."""
+    """Orthographic, about the centre of the shape."""
     import open3d as o3d
 
     points = s.shape.vertices_m @ s.camera_from_object[:3, :3].T

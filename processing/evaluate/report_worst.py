@@ -22,7 +22,7 @@ from recordings.results.track_notes import find_notes
 from recordings.tracks import ObjectTrack
 
 WORST = 6
-APART = 4
+LEAST_FRAMES_BETWEEN = 4
 """Frames of one toss that are shown lie at least so far apart."""
 LITTLE, BAD, MUCH = 0.6, 1.7, 1.6
 """Below this share of what is usual, or above it, a number is unusual: of what is seen, of the fit, of the speed."""
@@ -67,7 +67,7 @@ def worst_frames(results: Results, row: Row) -> list[Worst]:
     for _, toss, i in ranked:
         if len(found) == WORST:
             break
-        if all(t != toss or abs(i - k) >= APART for t, k in taken):
+        if all(t != toss or abs(i - k) >= LEAST_FRAMES_BETWEEN for t, k in taken):
             taken.append((toss, i))
             found.append(Worst(toss, i, _what(every[toss], i), reasons(every[toss], i)))
     return found

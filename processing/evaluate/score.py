@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any
@@ -31,6 +30,7 @@ from processing.evaluate.truth import Truth
 from processing.motion.frame_phases import PHASES, Phase, frame_phases
 from recordings.bounded.mesh_file import load_mesh
 from recordings.results.folder import Results, VariantRecord, read_contact
+from recordings.results.stage_files import stage_arrays, stage_document
 from recordings.tracks import ObjectShape, ObjectTrack
 
 if TYPE_CHECKING:
@@ -169,23 +169,24 @@ def rollout_scores(
         return None
     center = read_contact(results.path / stage).center_of_mass_m
     position, rotation, tosses = [], [], []
-    with np.load(results.path / stage / "rollouts.npz", allow_pickle=False) as stored:
-        for toss in (int(t) for t in stored["toss"]):
-            true = truth.camera_from_object(tracks[toss])
-            name = f"toss_{toss:02d}"
-            if true is None:
-                continue
-            times_s = 1e-9 * (tracks[toss].time_ns - tracks[toss].time_ns[0])
-            errors = rollout_errors(
-                stored[f"{name}.world_from_object"], stored[f"{name}.time_s"], world.matrix @ true, times_s, center
-            )
-            if errors is not None:
-                position.append(errors[0])
-                rotation.append(errors[1])
-                tosses.append(toss)
+    with stage_arrays(results.path / stage / "rollouts.npz") as stored:
+        rolled = {name: stored[name] for name in stored.files}
+    for toss in (int(t) for t in rolled["toss"]):
+        true = truth.camera_from_object(tracks[toss])
+        name = f"toss_{toss:02d}"
+        if true is None:
+            continue
+        times_s = 1e-9 * (tracks[toss].time_ns - tracks[toss].time_ns[0])
+        errors = rollout_errors(
+            rolled[f"{name}.world_from_object"], rolled[f"{name}.time_s"], world.matrix @ true, times_s, center
+        )
+        if errors is not None:
+            position.append(errors[0])
+            rotation.append(errors[1])
+            tosses.append(toss)
     if not tosses:
         return None
-    document = json.loads((results.path / stage / "rollout.json").read_text())
+    document = stage_document(results.path / stage / "rollout.json")
     return {
         "steps": len(position[0]), "dt_s": document["dt_s"], "tosses": tosses,
         "position_m": summarise(np.stack(position)).to_json(), "rotation_rad": summarise(np.stack(rotation)).to_json(),

@@ -177,17 +177,17 @@ def total_loss(model: ObjectField, poses: Poses, dataset: RayDataset, config: Fi
     passing = torch.randint(max(len(dataset.passing_view), 1), (config.rays // 4,), device=device)
     near = near_surface_samples(model, poses, dataset, chosen, config.near_samples)
     free = free_space_samples(model, poses, dataset, chosen[: config.rays // 4])
-    beside_m = passing_points(model, poses, dataset, passing) if len(dataset.passing_view) else near.points_m[:0]
+    passing_m = passing_points(model, poses, dataset, passing) if len(dataset.passing_view) else near.points_m[:0]
     around_m = eikonal_points(near.points_m[: config.rays // 2].detach())
     surface_m = to_object(poses, dataset.direction[chosen] * dataset.depth[chosen][:, None], dataset.view[chosen])
-    parts = [near.points_m, free.points_m, beside_m, around_m]
+    parts = [near.points_m, free.points_m, passing_m, around_m]
     distances, rgb = model.sdf_and_color(torch.cat(parts), surface_m)
-    at_near, at_free, at_beside, at_around = distances.split([len(p) for p in parts])
+    at_near, at_free, at_passing, at_around = distances.split([len(p) for p in parts])
     loss = near_surface_loss(at_near, near, model.truncation_m)
     loss = loss + config.free_weight * free_space_loss(at_free, free, model.truncation_m)
     loss = loss + config.color_weight * ((rgb - dataset.rgb[chosen]).abs() * dataset.colored[chosen, None]).mean()
-    if len(beside_m):
-        inside = inside_only(model, beside_m, at_beside)
+    if len(passing_m):
+        inside = inside_only(model, passing_m, at_passing)
         loss = loss + config.passing_weight * passing_loss(inside, model.truncation_m)
     return loss + config.eikonal_weight * eikonal_loss(at_around)
 

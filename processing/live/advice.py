@@ -47,11 +47,11 @@ def options(
     now, after the last toss (None: not known)."""
     found = []
     if sides and now_camera_from_object is not None:
-        now = surface_sigma_m(np.sum([s.told for s in sides], axis=0), extent_m)
+        now = surface_sigma_m(np.sum([s.information for s in sides], axis=0), extent_m)
         starts = next_starts(sides, now_camera_from_object, center_m, world_from_camera, extent_m)
         found += [_start(s, now) for s in starts]
     if law is not None:
-        found += [_like(t, law, throws) for t in law.told if t in throws]
+        found += [_like(t, law, throws) for t in law.information if t in throws]
     elif world_from_camera is not None and sides:
         found += _until_friction(throws)
     return sorted(found, key=lambda o: -o.shrink)

@@ -60,12 +60,12 @@ def follow(
     session: Path,
     config: Config,
     progress: Callable[[str], Progress],
-    told: Callable[[str], None],
+    console: Callable[[str], None],
     recorder: int | None = None,
     live: LiveConfig | None = None,
     sample: Path | None = None,
 ) -> Followed:
-    """Look at every toss until the session ends. `told`: says a line on the console; `recorder`: the process that
+    """Look at every toss until the session ends. `console`: prints a line; `recorder`: the process that
     records, where it is known: when it is gone, nothing more comes; `sample`: a session to load the kernels with while
     there is nothing to do yet.
 
@@ -76,7 +76,7 @@ def follow(
         live = live or LiveConfig()
         together = Together(calibration, CAMERA, live)
         looker = Looker(session, scratch, config, live, progress)
-        run = _Follower(session, looker, together, LiveWriter(session), live, told, recorder)
+        run = _Follower(session, looker, together, LiveWriter(session), live, console, recorder)
         bounds.come_last()
         bounds.bound_memory(live.memory_gb)
         try:
@@ -148,11 +148,11 @@ class _Follower:
     together: Together
     writer: LiveWriter
     live: LiveConfig
-    told: Callable[[str], None]
+    console: Callable[[str], None]
     recorder: int | None
     done: dict[int, FileId] = field(default_factory=dict)
     result: Followed = field(default_factory=Followed)
-    said_behind_s: float = 0.0
+    lag_reported_s: float = 0.0
     started_s: float = field(default_factory=time.time)
     side: SideWork[LawSoFar] = field(default_factory=SideWork)
 
@@ -187,10 +187,10 @@ class _Follower:
         waiting = [t for t in files if t not in self.done]
         if waiting:
             self.side.stop()  # a law of fewer tosses is of no use any more
-            self._tell_behind(files, waiting)
+            self._report_lag(files, waiting)
             self._look_at(waiting[0], files[waiting[0]], len(waiting) - 1)
             return True
-        self.said_behind_s = 0.0
+        self.lag_reported_s = 0.0
         if self._idle():
             return True
         if self.recorder is not None and not alive(self.recorder) and not ended(self.session):
@@ -223,9 +223,9 @@ class _Follower:
             self.result.failed[toss] = str(wrong)
             self._say("fault", f"toss {toss}: {wrong}", toss)
         else:
-            self._tell(toss, joined, file)
+            self._report(toss, joined, file)
 
-    def _tell(self, toss: int, joined: Joined, file: FileId) -> None:
+    def _report(self, toss: int, joined: Joined, file: FileId) -> None:
         report = self.together.report(joined, self._waited_s(file))
         self.result.looked_at.append(toss)
         self._written(lambda: self.writer.toss(report))
@@ -276,10 +276,10 @@ class _Follower:
         self.side.start(placed, self.together.learn_law)
         return False
 
-    def _tell_behind(self, files: dict[int, FileId], waiting: list[int]) -> None:
+    def _report_lag(self, files: dict[int, FileId], waiting: list[int]) -> None:
         behind_s = max(self._waited_s(files[t]) for t in waiting)
-        if len(waiting) > 1 and behind_s > max(self.live.late_s, 2 * self.said_behind_s):
-            self.said_behind_s = behind_s
+        if len(waiting) > 1 and behind_s > max(self.live.late_s, 2 * self.lag_reported_s):
+            self.lag_reported_s = behind_s
             text = f"live: {behind_s:.0f} s behind, {len(waiting)} tosses wait; recording goes on as before"
             self._say("behind", text)
 
@@ -291,7 +291,7 @@ class _Follower:
         self._written(lambda: self.writer.state(State(state, os.getpid(), toss, waiting, round(behind_s, 1))))
 
     def _say(self, kind: Kind, text: str, toss: int | None = None) -> None:
-        self.told(text)
+        self.console(text)
         self._written(lambda: self.writer.say(kind, text, toss))
 
     def _written(self, write: Callable[[], object]) -> None:

@@ -29,14 +29,14 @@ CONTACTS, POINTS = 6, 24
 
 @dataclass(frozen=True)
 class LawSoFar:
-    """Friction and restitution with half their 95 % intervals; `told`: how much each toss said of friction (curvature
+    """Friction and restitution with half their 95 % intervals; `information` on friction by toss (curvature
     of its score over log friction; nothing where it said nothing), by toss."""
 
     friction: float
     friction_half: float
     restitution: float
     restitution_half: float
-    told: Mapping[int, float]
+    information: Mapping[int, float]
 
     def text(self) -> str:
         """With 95 % intervals."""
@@ -60,8 +60,8 @@ def law_so_far(
     step = float(PROFILE[1] - PROFILE[0])
     middle = int(np.abs(PROFILE).argmin())
     bend = np.diff(found.profile, 2, axis=0)[max(middle - 2, 0) : middle + 1].mean(0) / step**2
-    told = {t: max(float(b), 0.0) for t, b in zip(hit, bend)} if len(hit) == len(bend) else {}
-    return LawSoFar(found.value, found.half_width, found.law.restitution, found.restitution_half_width, told)
+    information = {t: max(float(b), 0.0) for t, b in zip(hit, bend)} if len(hit) == len(bend) else {}
+    return LawSoFar(found.value, found.half_width, found.law.restitution, found.restitution_half_width, information)
 
 
 def _prepared(
@@ -83,5 +83,5 @@ def _prepared(
 def shrink_by(law: LawSoFar, toss: int) -> float:
     """By what share friction's interval is expected to shrink with one more toss like this one (its part that tosses
     can take away: what the law itself does not know stays)."""
-    total, more = sum(law.told.values()), law.told.get(toss, 0.0)
+    total, more = sum(law.information.values()), law.information.get(toss, 0.0)
     return 1.0 - float(np.sqrt(total / (total + more))) if total > 0 else 0.0

@@ -42,10 +42,10 @@ def directions() -> Float[Array, "d 3"]:
 
 @dataclass(frozen=True, eq=False)
 class TossSides:
-    """What one toss told of each direction, 1/m^2: in the object frame (`told`), and in camera axes by how the object
-    lay when the toss began (`pattern`); which directions touched the table."""
+    """Information (1/variance, 1/m^2) that one toss gives on the surface in each direction: in the object frame, and
+    (`pattern`) in camera axes by how the object lay when the toss began; which directions touched the table."""
 
-    told: Float[Array, " d"]
+    information: Float[Array, " d"]
     pattern: Float[Array, " d"]
     touched: Bool[Array, " d"]
 
@@ -62,24 +62,26 @@ def sides_of(
         at = pose[:3, :3] @ center_m + pose[:3, 3]
         facing = around @ (-(pose[:3, :3].T @ at) / np.linalg.norm(at))
         sigma = float(stereo_sigma_m(np.array([at[2]], dtype=np.float32))[0])
-        told = np.where(facing > FACES, (facing / sigma) ** 2, 0.0)
-        best, total = np.maximum(best, told), total + told
+        information = np.where(facing > FACES, (facing / sigma) ** 2, 0.0)
+        best, total = np.maximum(best, information), total + information
         if world_from_camera is not None and impact is not None and i >= impact:
             down = pose[:3, :3].T @ (world_from_camera.rotation.T @ np.array([0.0, 0.0, -1.0]))
             touched |= around @ down > TOUCHED_COS
-    told = best + TOGETHER * (total - best)
-    return TossSides(told, _turned(told, track.camera_from_object[kept[0], :3, :3]) if kept else told, touched)
+    information = best + TOGETHER * (total - best)
+    return TossSides(
+        information, _turned(information, track.camera_from_object[kept[0], :3, :3]) if kept else information, touched
+    )
 
 
-def _turned(told: Float[Array, " d"], new_from_old: Float[Array, "3 3"]) -> Float[Array, " d"]:
+def _turned(information: Float[Array, " d"], new_from_old: Float[Array, "3 3"]) -> Float[Array, " d"]:
     """A map over directions in other axes."""
     around = directions()
-    return told[np.argmax(around @ new_from_old @ around.T, axis=1)]
+    return information[np.argmax(around @ new_from_old @ around.T, axis=1)]
 
 
-def surface_sigma_m(told: Float[Array, " d"], extent_m: float) -> float:
+def surface_sigma_m(information: Float[Array, " d"], extent_m: float) -> float:
     """Root mean square standard deviation of the surface over all directions."""
-    return float(np.sqrt(np.mean(1.0 / (1.0 / (GUESS * extent_m) ** 2 + told))))
+    return float(np.sqrt(np.mean(1.0 / (1.0 / (GUESS * extent_m) ** 2 + information))))
 
 
 @dataclass(frozen=True)
@@ -99,17 +101,19 @@ def next_starts(
 ) -> list[Start]:  # fmt: skip
     """The six sides of the object as it lies now (its last pose), best start first. A toss is expected to show what
     those so far have shown, turned with the side that it begins with."""
-    told, touched = sum(t.told for t in tosses), np.any([t.touched for t in tosses], axis=0)
+    information, touched = sum(t.information for t in tosses), np.any([t.touched for t in tosses], axis=0)
     pattern, around = np.mean([t.pattern for t in tosses], axis=0), directions()
     rotation, at = camera_from_object[:3, :3], camera_from_object[:3, :3] @ center_m + camera_from_object[:3, 3]
     to_camera = -at / np.linalg.norm(at)
     found = []
     for name, axis in zip(NAMES, _axes(to_camera, world_from_camera)):
         turn = _shortest(axis, to_camera) @ rotation  # camera_from_object at that start
-        sigma = surface_sigma_m(told + _turned(pattern, turn.T), extent_m)
+        sigma = surface_sigma_m(information + _turned(pattern, turn.T), extent_m)
         near = around @ (rotation.T @ axis) > TOUCHED_COS
         guess = 1.0 / (GUESS * extent_m) ** 2
-        found.append(Start(name, sigma, bool(np.median(np.asarray(told)[near]) < guess), not bool(touched[near].any())))
+        found.append(
+            Start(name, sigma, bool(np.median(np.asarray(information)[near]) < guess), not bool(touched[near].any()))
+        )
     return sorted(found, key=lambda s: s.sigma_m)
 
 

@@ -18,7 +18,7 @@ def frame_phases(
     time_ns: Int64[Array, " n"], world_from_object: Float[Array, "n 4 4"], center_m: Float[Array, "3"]
 ) -> list[Phase]:
     """Held until release; impact where neither flight nor rest explains the motion, and two frames around; rest at the
-    end. `center_m`: the middle of mass in the object frame. Frames without a pose take their neighbours' phase."""
+    end. `center_m`: the centre of mass in the object frame. Frames without a pose take their neighbours' phase."""
     from processing.motion.phases import find_phases
     from processing.motion.trajectory import PoseSeries
 

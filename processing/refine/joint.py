@@ -109,7 +109,7 @@ def solve_jointly(
     controls = Controls.of(shape, config.controls, config.shape_reach)
     offsets = np.zeros(len(controls.points_m))
     begun = poses
-    poses, center = poses.copy(), controls.middle_m if world is None else world.center_m
+    poses, center = poses.copy(), controls.center_m if world is None else world.center_m
     costs: list[dict[str, float]] = []
     information = np.zeros((len(frames), 6, 6))
     for _ in range(config.rounds):

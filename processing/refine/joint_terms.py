@@ -60,7 +60,7 @@ class Controls:
 
     points_m: Float[Array, "k 3"]
     reach_m: float
-    middle_m: Float[Array, "3"]
+    center_m: Float[Array, "3"]
     tree: cKDTree
 
     NEAR = 6
@@ -75,8 +75,8 @@ class Controls:
             gap = np.minimum(gap, np.linalg.norm(vertices - vertices[chosen[-1]], axis=1))
         points = vertices[chosen]
         extent_m = float(np.ptp(vertices, axis=0).mean())
-        middle = 0.5 * (vertices.min(0) + vertices.max(0))
-        return Controls(points, reach * extent_m, middle, cKDTree(points))
+        center = 0.5 * (vertices.min(0) + vertices.max(0))
+        return Controls(points, reach * extent_m, center, cKDTree(points))
 
     def weights(self, points_m: Float[Array, "n 3"]) -> tuple[Int[Array, "n c"], Float[Array, "n c"]]:
         """Which control points move a point, and by how much of their offsets."""

@@ -14,7 +14,7 @@ from processing.sensor.render import Occlusion, Renderer, Reprojection, reprojec
 from recordings.records import RgbdFrame
 
 Depth = Literal["rendered", "filled"]
-BESIDE_PX = 9
+SHADOW_PX = 9
 """Width of the window round a pixel in front of the object in which missing depth is its doing."""
 
 
@@ -76,8 +76,8 @@ def _filled(
     """
     import cv2
 
-    beside = cv2.dilate(in_front.astype(np.uint8), np.ones((BESIDE_PX, BESIDE_PX), np.uint8)) > 0  # shadows of stereo
-    unknown = drawn.mask & ~raw_mask & (in_front | (beside & (depth_m == 0)))
+    shadow = cv2.dilate(in_front.astype(np.uint8), np.ones((SHADOW_PX, SHADOW_PX), np.uint8)) > 0  # shadows of stereo
+    unknown = drawn.mask & ~raw_mask & (in_front | (shadow & (depth_m == 0)))
     wrong = raw_mask & drawn.mask & ((depth_m == 0) | (np.abs(depth_m - drawn.depth_m) > config.agrees_m))
     return raw_mask | unknown, np.where(unknown | wrong, drawn.depth_m, depth_m).astype(np.float32)
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import time
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from processing.contact.learn.convexity import CLASSES, ClassName
-from processing.contact.learn.data_checks import check_frames, duplicate_groups, refuse_leaks
+from processing.contact.learn.data_checks import check_frames, duplicate_groups, of_own_tracks, refuse_leaks
 from processing.contact.learn.fit import FitConfig
 from processing.contact.learn.from_tracks import TracksConfig, learn_from_series
 from processing.contact.learn.learn import ContactConfig, ContactLearning, learn_contact
@@ -35,6 +35,7 @@ from processing.store import Store
 from recordings.errors import BadInput
 from recordings.progress import Progress
 from recordings.results.folder import VariantRecord, write_contact, write_shape, write_variant
+from recordings.results.stage_files import stage_document
 from recordings.tracks import ObjectShape
 from recordings.whole_file import write_json
 
@@ -85,7 +86,8 @@ def learn_contact_only(
     config = ContactConfig(fit=FitConfig(device=device, friction_start=0.03), rollout_steps=steps)
 
     def compute(folder: Path) -> ContactOnlyResult:
-        learning, shape, extra = _learn(train, geometry, init_m, source, given, plane, config, progress)
+        with of_own_tracks() if source.of_vision else nullcontext():
+            learning, shape, extra = _learn(train, geometry, init_m, source, given, plane, config, progress)
         evaluation = evaluate(learning, [tracks[t] for t in tested], plane, steps, STEP_S, "thrown")
         document, more = result_document(learning, evaluation), _warnings(geometry, source, wanted, steps)
         document |= {
@@ -121,7 +123,7 @@ def learn_contact_only(
         ContactOnlyResult,
         compute,
     )
-    document = json.loads((done.folder / "result.json").read_text())
+    document = stage_document(done.folder / "result.json")
     files = {
         "folder": str(done.folder),
         "plot": str(done.folder / "rollout.png"),

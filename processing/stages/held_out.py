@@ -68,13 +68,11 @@ def halves_of(tracks: Mapping[int, Done], shapes: Mapping[int, Done]) -> tuple[H
     return Half(first, second, shape), Half(second, first, shape)
 
 
-def why_no_halves(tracks: Mapping[int, Done], losses: Mapping[int, float]) -> tuple[str, ...]:
-    """What to say where no toss was held out."""
-    if losses:
-        return ()
-    if len(tracks) < LEAST_TOSSES:
-        return (f"fewer than {LEAST_TOSSES} tosses together: {ALONE}",)
-    return (f"contact cannot be learned from each half of the tosses: {ALONE}",)
+def why_not_by_contact(tosses: int) -> str:
+    """What to say where passes were not compared by contact."""
+    if tosses < LEAST_TOSSES:
+        return f"fewer than {LEAST_TOSSES} tosses together: {ALONE}"
+    return f"contact cannot be learned from each half of the tosses: {ALONE}"
 
 
 def losses_of(judged: Sequence[Done[HeldOutResult]]) -> dict[int, float]:

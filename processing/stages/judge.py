@@ -13,6 +13,7 @@ from processing.refine.image_residuals import Explained, explain, pooled
 from processing.run import Run
 from processing.store import Done
 from recordings.results.folder import read_shape, read_track
+from recordings.results.stage_files import stage_arrays
 from recordings.whole_file import write_json
 
 VERSION = 4
@@ -57,5 +58,5 @@ def judge(
 
 def residuals(judged: Done[JudgeResult]) -> Explained:
     """The residuals of single frames that the stage keeps."""
-    with np.load(judged.folder / "residuals.npz", allow_pickle=False) as stored:
+    with stage_arrays(judged.folder / "residuals.npz") as stored:
         return Explained(stored["rows"], judged.result.lost)

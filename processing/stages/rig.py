@@ -168,10 +168,10 @@ def with_depth_in_time(run: Run, scene: Done, masks: Mapping[int, Done]) -> Run:
     keys = {f"toss_{t:02d}": hashlib.sha256(f"{run.keys[f'toss_{t:02d}']} depth {later_ns}".encode()).hexdigest()
             for t in run.recorded}  # fmt: skip
     return replace(run, session=with_depth_later(run.session, later_ns), keys={**run.keys, **keys},
-                   warnings=(*run.warnings, _told_late(result)))  # fmt: skip
+                   warnings=(*run.warnings, _late_depth(result)))  # fmt: skip
 
 
-def _told_late(result: DepthDelayResult) -> Notice:
+def _late_depth(result: DepthDelayResult) -> Notice:
     assert result.seen_s is not None
     assert result.sigma_s is not None
     seen = (

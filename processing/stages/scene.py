@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from processing.run import CAMERA, Run, toss_keys
-from processing.scene_frames import hidden_by_robot, keys_beside, read, scene_frames
+from processing.scene_frames import background_keys, hidden_by_robot, read, scene_frames
 from processing.segment.background.static_scene import (
     StaticScene,
     calibrated_table_depth,
@@ -41,7 +41,7 @@ def learn_static_scene(run: Run) -> Done[SceneResult]:
     """From frames of all tosses of the run, and of those beside them in the session that can be read and show the
     same. Depth is as reported."""
     inputs = {name: run.keys[name] for name in ("calibration", *(f"toss_{t:02d}" for t in run.recorded))}
-    inputs |= keys_beside(run)
+    inputs |= background_keys(run)
     return run.store.run("scene", VERSION, run.config.scene, inputs, SceneResult, lambda folder: _learn(run, folder))
 
 
@@ -104,8 +104,8 @@ def measure_noise(run: Run, scene: Done) -> Done[NoiseResult]:
         rays = rays / np.maximum(rays[..., 2:], 1e-9)
         chosen = np.unique(np.linspace(0, len(frames) - 1, NOISE_FRAMES).astype(int))
         found = [measured_noise(frames[int(i)].depth_m, background.table_depth_m, rays) for i in chosen]
-        told = [n for n in found if n is not None] or [PUBLISHED]
-        sigma, patch = (float(np.median([getattr(n, name) for n in told])) for name in ("sigma_at_1m", "patch_px"))
+        measured = [n for n in found if n is not None] or [PUBLISHED]
+        sigma, patch = (float(np.median([getattr(n, name) for n in measured])) for name in ("sigma_at_1m", "patch_px"))
         return NoiseResult(sum(n is not None for n in found), sigma, patch)
 
     return run.store.run("noise", NOISE_VERSION, {}, {"scene": scene.key, **toss_keys(run, toss)}, NoiseResult, compute)

@@ -17,6 +17,7 @@ from processing.run import Run, each
 from processing.sensor.still import Kept, ThinnedSession, kept_of, still_stretches, whole_session
 from processing.store import Done
 from recordings.results.folder import RobotMasks, read_masks, read_track, write_masks, write_track
+from recordings.results.stage_files import stage_document
 
 VERSION = 2
 
@@ -64,7 +65,7 @@ def _kept(run: Run, toss: int) -> Kept | None:
     done = run.store.run("still", VERSION, settings, {name: run.keys[name]}, StillResult, compute)
     if done.result.kept == done.result.frames:
         return None
-    stored = json.loads((done.folder / "still.json").read_text())
+    stored = stage_document(done.folder / "still.json")
     return Kept(*(np.array(stored[k], dtype=np.int64) for k in ("positions", "like")))
 
 

@@ -227,7 +227,7 @@ def refined(
     else:
         body = RoundBody(scene.store, poses, use, axis, config.body)
         twist = axis.twist if held else None
-        joint = refine(scene.store, poses, seen, np.zeros_like(fixed), motion, config.graph, twist, beside=(body,))
+        joint = refine(scene.store, poses, seen, np.zeros_like(fixed), motion, config.graph, twist, priors=(body,))
         moved, spread, axis = anchored(joint.poses, joint.covariance, axis, first, poses[first])
         joint = replace(joint, poses=moved, covariance=spread)
     fit = np.nanmean(per_view(joint.pairs, joint.figures, all_views)[0][:n]) if len(joint.pairs) else 0.0

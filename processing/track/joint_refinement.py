@@ -161,11 +161,11 @@ def refine(
     config: GraphConfig,
     held: Float[Array, "6"] | None = None,
     tied: Int[Array, " n"] | None = None,
-    beside: Sequence[Terms] = (),
+    priors: Sequence[Terms] = (),
 ) -> Refined:
     """All poses in `use` at once; those in `fixed` stay. `poses` of other views are returned as they are. No pose moves
     along the twist `held`, where there is one. Views with the same number in `tied` move as one (not at all with a
-    fixed one); those with -1 move alone. `beside`: what else is known of the poses."""
+    fixed one); those with -1 move alone. `priors`: what else is known of the poses."""
     poses = poses.copy()
     free = use & ~fixed
     place = np.where(free, np.cumsum(free) - 1, -1)
@@ -178,7 +178,7 @@ def refine(
     H = np.eye(6 * (int(place.max(initial=-1)) + 1))
     for row in rows(config.schedule, distance, config.round_body):
         for _ in range(int(row[k.STEPS])):
-            H, g, figures = _normal_equations(store, poses, use, pairs, place, row, motion, config, beside)
+            H, g, figures = _normal_equations(store, poses, use, pairs, place, row, motion, config, priors)
             if held is not None:
                 _hold(H, held)
             step = -np.linalg.solve(H + np.diag(1e-6 * np.diag(H) + 1e-9), g).reshape(-1, 6)
@@ -210,7 +210,7 @@ def _hold(H: Float[Array, "f f"], held: Float[Array, "6"]) -> None:
 def _normal_equations(
     store: ViewStore, poses: Float[Array, "n 4 4"], use: Bool[Array, " n"], pairs: Int[Array, "m 2"],
     place: Int[Array, " n"], row: Float[Array, "7"], motion: Motion, config: GraphConfig,
-    beside: Sequence[Terms],
+    priors: Sequence[Terms],
 ) -> tuple[Float[Array, "f f"], Float[Array, " f"], Float[Array, "m 3"]]:  # fmt: skip
     count = int(place.max()) + 1
     blocks, gradients = np.zeros((len(pairs), 6, 6)), np.zeros((len(pairs), 6))
@@ -225,7 +225,7 @@ def _normal_equations(
     H, g = np.zeros((count, count, 6, 6)), np.zeros((count, 6))
     add_pairs(H, g, blocks, gradients, place[pairs])
     _add_motion(H, g, poses, use, place, motion, config)
-    for terms in beside:
+    for terms in priors:
         terms.add(H, g, poses, place)
     return H.transpose(0, 2, 1, 3).reshape(6 * count, 6 * count), g.reshape(-1), figures
 

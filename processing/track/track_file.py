@@ -14,11 +14,11 @@ from processing.motion.motion_prior import gravity_in_camera
 from processing.track.beam import Scene
 from processing.track.depth_color_offset import put_at_color_times
 from processing.track.track_toss import TossTrack, TrackConfig, views_of
-from recordings.errors import BadInput
 from recordings.geometry import CameraModel, Transform
 from recordings.progress import Silent
 from recordings.records import RgbdFrame
 from recordings.results.folder import read_track, write_track
+from recordings.results.stage_files import stage_arrays
 
 
 def write_toss_track(folder: Path, tracked: TossTrack) -> None:
@@ -52,25 +52,20 @@ def read_toss_track(
     has it at colour's exposure. The rejected candidates are gone."""
     track = read_track(folder, toss)
     store, times_s, _ = views_of(frames, masks, camera, confidence, config, world_from_camera, Silent())
-    try:
-        with np.load(folder / f"toss_{toss:02d}.fit.npz", allow_pickle=False) as stored:
-            tracked = TossTrack(
-                track=track,
-                cost=stored["cost"],
-                on_surface=stored["on_surface"],
-                keyframes=tuple(int(i) for i in stored["keyframes"]),
-                pairs=stored["pairs"],
-                rejected={},
-                center_m=stored["center_m"],
-                margin=float(stored["margin"]),
-                store=store,
-                round_body=bool(stored["round_body"]),
-                held=stored["held"],
-            )
-    except (OSError, KeyError, ValueError) as wrong:
-        raise BadInput(
-            f"{folder} lacks how toss {toss} was tracked ({wrong}); remove that folder and run again"
-        ) from wrong
+    with stage_arrays(folder / f"toss_{toss:02d}.fit.npz") as stored:
+        tracked = TossTrack(
+            track=track,
+            cost=stored["cost"],
+            on_surface=stored["on_surface"],
+            keyframes=tuple(int(i) for i in stored["keyframes"]),
+            pairs=stored["pairs"],
+            rejected={},
+            center_m=stored["center_m"],
+            margin=float(stored["margin"]),
+            store=store,
+            round_body=bool(stored["round_body"]),
+            held=stored["held"],
+        )
     gravity = gravity_in_camera(None if world_from_camera is None else world_from_camera.matrix)
     scene = Scene(store, times_s, gravity, tracked.center_m, Sift())
     put_at_color_times(scene, track.camera_from_object, ~track.lost)

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from recordings.bounded.limits import DEEPEST, MOST_DOCUMENT_BYTES
+from recordings.bounded.limits import DEEPEST, MOST_DOCUMENT_BYTES, read_bytes
 from recordings.errors import BadInput, DamagedFile
 
 FORMAT_VERSION = 1
@@ -28,16 +28,15 @@ def json_object(text: str | bytes) -> dict[str, Any]:
 
 def read_document(path: Path) -> Mapping[str, Any]:
     """session.json, checked for its version. Raises BadInput."""
-    try:
-        data = path.read_bytes()
-    except OSError as refused:
-        raise BadInput(f"{path} cannot be read: {refused.strerror}") from refused
-    return parse_document(data, str(path))
+    return _versioned(read_json(path), str(path))
 
 
 def parse_document(data: bytes, name: str) -> Mapping[str, Any]:
     """A document whose version this tosslab reads. Raises BadInput."""
-    document = parse_json(data, name)
+    return _versioned(parse_json(data, name), name)
+
+
+def _versioned(document: Any, name: str) -> Mapping[str, Any]:
     if not isinstance(document, dict) or document.get("format_version") != FORMAT_VERSION:
         found = document.get("format_version") if isinstance(document, dict) else type(document).__name__
         raise BadInput(f"{name}: format_version {found!r}; this tosslab reads {FORMAT_VERSION}")
@@ -63,11 +62,11 @@ def parse_json(data: bytes | str, name: str) -> Any:
 def read_json(path: Path, next_step: str = "") -> Any:
     """A JSON file. Raises BadInput where it cannot be opened, DamagedFile where it is none; `next_step` ends both."""
     try:
-        data = path.read_bytes()
+        return parse_json(read_bytes(path, MOST_DOCUMENT_BYTES, "a JSON document"), str(path))
     except OSError as refused:
         raise BadInput(f"{path} cannot be read ({refused.strerror}){next_step}") from refused
-    try:
-        return parse_json(data, str(path))
+    except ValueError as wrong:
+        raise DamagedFile(f"{path} is {wrong}{next_step}") from wrong
     except DamagedFile as wrong:
         raise DamagedFile(f"{wrong}{next_step}") from wrong
 

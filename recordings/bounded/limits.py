@@ -133,6 +133,14 @@ def copy_unpacked(packed: Any, out: Any, file_bytes: int) -> None:
         out.write(block)
 
 
+def read_bytes(path: Path, most: int, what: str) -> bytes:
+    """A file's bytes, never more than `most`. Raises OSError, ValueError."""
+    if (size := path.stat().st_size) > most:
+        raise ValueError(f"{what} of {size} bytes; wanted at most {most}")
+    with open(path, "rb") as file:
+        return file.read(most)
+
+
 @contextmanager
 def open_npz(path: Path) -> Iterator[Any]:
     """The arrays of an .npz by name, once its directory and the arrays' headers were found within the limits.

@@ -140,18 +140,18 @@ class Stage:
 
 
 def path_m(track: ObjectTrack, shape: ObjectShape | None) -> Float[Array, "n 3"]:
-    """The way of the object's middle in the camera's frame; NaN where the pose is lost."""
-    return track.camera_from_object[:, :3, :3] @ _middle_m(shape) + track.camera_from_object[:, :3, 3]
+    """The way of the object's centre in the camera's frame; NaN where the pose is lost."""
+    return track.camera_from_object[:, :3, :3] @ _center_m(shape) + track.camera_from_object[:, :3, 3]
 
 
-def _middle_m(shape: ObjectShape | None) -> Float[Array, "3"]:
+def _center_m(shape: ObjectShape | None) -> Float[Array, "3"]:
     return np.zeros(3) if shape is None else 0.5 * (shape.vertices_m.min(0) + shape.vertices_m.max(0))
 
 
 def _radius_m(shape: ObjectShape | None) -> float:
     if shape is None:
         return UNKNOWN_RADIUS_M
-    return float(np.linalg.norm(shape.vertices_m - _middle_m(shape), axis=1).max())
+    return float(np.linalg.norm(shape.vertices_m - _center_m(shape), axis=1).max())
 
 
 def _eye(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import heapq
-import json
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -16,7 +15,7 @@ import numpy as np
 from jaxtyping import Int64
 from numpy import ndarray as Array
 
-from recordings.bounded.documents import parse_json
+from recordings.bounded.documents import parse_json, read_json
 from recordings.errors import BadInput
 from recordings.session_writer import SessionWriter
 from recordings.tracks import RigCalibration
@@ -84,7 +83,7 @@ def new_session(out: Path, start: Mapping[str, Any], calibration: RigCalibration
 
 def report(writer: SessionWriter, layout: str, warnings: Warnings, truth: bool = False) -> ImportReport:
     """The report of a finished session, its counts taken from the stop document."""
-    document = json.loads((writer.folder / "session.json").read_text())["stop"]
+    document = read_json(writer.folder / "session.json")["stop"]
     streams: dict[str, int] = {}
     for name, counts in document["streams"].items():
         for topic, n in counts.items() if name.startswith("toss_") else ():

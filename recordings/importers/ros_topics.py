@@ -44,10 +44,10 @@ def choose(bag: Bag, color: str | None, depth: str | None) -> Topics:
     if not kinds:
         named = ", ".join(f"{t} ({kind})" for t, kind in sorted(bag.types.items())) or "none"
         raise BadInput(f"{bag.path} holds no images (sensor_msgs Image or CompressedImage); its topics are: {named}")
-    odd = {t: kind for t, kind in kinds.items() if kind not in ("color", "depth", "grey")}
+    unknown = {t: kind for t, kind in kinds.items() if kind not in ("color", "depth", "grey")}
     colors, depths = ([t for t, kind in kinds.items() if kind == k] for k in ("color", "depth"))
-    if odd and not colors:
-        topic, encoding = next(iter(odd.items()))
+    if unknown and not colors:
+        topic, encoding = next(iter(unknown.items()))
         raise BadInput(f"{bag.path}: {topic} is encoded in '{encoding}'; wanted {', '.join(CHANNELS)}, JPEG or PNG")
     chosen_color = color or _one(bag, _without_twins(colors), "--color")
     chosen_depth = depth or _one(bag, _aligned_first(_without_twins(depths)), "--depth")

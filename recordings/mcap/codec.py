@@ -223,20 +223,20 @@ def encode_pose_quality(pose: StampedPose) -> Payload:
 
 def read_pose(message: Message, quality: Message | None) -> StampedPose:
     box = _parse(PoseInFrame, message)
-    beside = _parse(own.PoseQuality, quality) if quality is not None else None
+    stored = _parse(own.PoseQuality, quality) if quality is not None else None
     matrix = np.full((4, 4), np.nan)
     p, q = box.pose.position, box.pose.orientation
     if np.isfinite([p.x, p.y, p.z, q.w]).all():
         matrix = Transform.from_quaternion(
             box.frame_id, "object", np.array([q.w, q.x, q.y, q.z]), np.array([p.x, p.y, p.z])
         ).matrix
-    status = beside.status if beside is not None else "tracked"
+    status = stored.status if stored is not None else "tracked"
     if status not in get_args(Status):
         raise DamagedFile(f"{message.topic}: status '{status}'; wanted tracked, interpolated or lost")
     covariance = (
-        np.array(beside.covariance).reshape(6, 6) if beside is not None and len(beside.covariance) == 36 else None
+        np.array(stored.covariance).reshape(6, 6) if stored is not None and len(stored.covariance) == 36 else None
     )
-    source = beside.source_frame if beside is not None else "object"
+    source = stored.source_frame if stored is not None else "object"
     return StampedPose(_time_ns(box.timestamp), box.frame_id, source, matrix, cast(Status, status), covariance)
 
 

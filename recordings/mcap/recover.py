@@ -99,7 +99,7 @@ class _Rewriting:
             else:
                 self._message(item)
         self._own_metadata()
-        self._calibration_from_beside()
+        self._calibration_from_session()
         report = self._report()
         self._say(report)
         sha256 = self.writer.finish()
@@ -122,14 +122,14 @@ class _Rewriting:
         kind = "calibration" if stem == "calibration" else "toss"
         self.writer.metadata("tosslab", {"format_version": str(FORMAT_VERSION), "kind": kind, "info": json.dumps(info)})
 
-    def _calibration_from_beside(self) -> None:
+    def _calibration_from_session(self) -> None:
         """The session's own calibration.json, where the file's copy was lost and that one is whole."""
-        beside = self.source.parent / CALIBRATION
-        if CALIBRATION in self.attached or "tosslab" not in self.metadata or not beside.is_file():
+        sibling = self.source.parent / CALIBRATION
+        if CALIBRATION in self.attached or "tosslab" not in self.metadata or not sibling.is_file():
             return
         try:
-            RigCalibration.read(beside)
-            data = beside.read_bytes()
+            RigCalibration.read(sibling)
+            data = sibling.read_bytes()
         except (TosslabError, OSError):
             return
         self.writer.attachment(CALIBRATION, "application/json", data)

@@ -22,12 +22,12 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray as Array
 
-from recordings.bounded.documents import read_json
-from recordings.bounded.limits import open_npz, read_npy
+from recordings.bounded.limits import read_npy
 from recordings.errors import BadInput, DamagedFile
 from recordings.mcap.codec import decode_mask
 from recordings.notices import Notice
 from recordings.results.shape_file import read_shape, write_shape
+from recordings.results.stage_files import stage_arrays, stage_document, stage_file
 from recordings.tracks import ContactModel, ObjectShape, ObjectTrack, RigCalibration, Status
 from recordings.whole_file import write_bytes, write_json
 
@@ -83,20 +83,17 @@ def read_track(folder: Path, toss: int) -> ObjectTrack:
     path = folder / f"{_stem(toss)}.track.npz"
     if not path.exists():
         raise BadInput(f"{folder} holds no track of toss {toss}; run toss-process again to make it")
-    try:
-        with open_npz(path) as stored:
-            names = [str(n) for n in stored["status_names"]]
-            return ObjectTrack(
-                toss=int(stored["toss"]),
-                camera=str(stored["camera"]),
-                object_frame=str(stored["object_frame"]),
-                time_ns=stored["time_ns"].astype(np.int64),
-                camera_from_object=stored["camera_from_object"].astype(np.float64),
-                status=tuple(CODES[CODES.index(names[s])] for s in stored["status"]),
-                covariance=stored["covariance"].astype(np.float64),
-            )
-    except (OSError, ValueError, KeyError, IndexError, TypeError) as wrong:
-        raise DamagedFile(f"{path} cannot be read ({wrong}); remove its folder and run toss-process again") from wrong
+    with stage_arrays(path) as stored:
+        names = [str(n) for n in stored["status_names"]]
+        return ObjectTrack(
+            toss=int(stored["toss"]),
+            camera=str(stored["camera"]),
+            object_frame=str(stored["object_frame"]),
+            time_ns=stored["time_ns"].astype(np.int64),
+            camera_from_object=stored["camera_from_object"].astype(np.float64),
+            status=tuple(CODES[CODES.index(names[s])] for s in stored["status"]),
+            covariance=stored["covariance"].astype(np.float64),
+        )
 
 
 def write_masks(folder: Path, toss: int, masks: Sequence[Bool[Array, "h w"]], confidence: Float[Array, " n"]) -> Path:
@@ -152,7 +149,7 @@ def read_masks(folder: Path, toss: int) -> Masks:
     paths = sorted((folder / f"{_stem(toss)}.masks").glob("*.png"))
     if not paths:
         raise BadInput(f"{folder} holds no masks of toss {toss}; run toss-process again to make them")
-    document = _read_json(folder / f"{_stem(toss)}.masks.json")
+    document = stage_document(folder / f"{_stem(toss)}.masks.json")
     return Masks(paths, np.array(document.get("confidence", [np.nan] * len(paths)), dtype=np.float64))
 
 
@@ -186,17 +183,15 @@ def write_contact(folder: Path, model: ContactModel) -> Path:
 
 def read_contact(folder: Path) -> ContactModel:
     """Read a stage's ContactModel. Raises BadInput where it has none."""
-    document = dict(_read_json(folder / "contact.json"))
+    document = dict(stage_document(folder / "contact.json"))
     document.pop("format_version", None)
-    try:
+    with stage_file(folder / "contact.json"):
         arrays = {
             name: np.array(document[name], dtype=np.float64)
             for name in ("support_vertices_m", "inertia_kgm2", "center_of_mass_m", "plane_normal_world")
         }
         pieces = tuple(tuple(int(i) for i in piece) for piece in document["pieces"])
         return ContactModel(**{**document, **arrays, "pieces": pieces})
-    except (KeyError, TypeError, ValueError) as wrong:
-        raise DamagedFile(f"{folder / 'contact.json'}: {type(wrong).__name__}: {wrong}") from wrong
 
 
 @dataclass(frozen=True)
@@ -259,7 +254,7 @@ def write_variant(results: Path, record: VariantRecord) -> Path:
 
 
 def _read_variant(path: Path) -> VariantRecord:
-    document = dict(_read_json(path))
+    document = dict(stage_document(path))
     version = document.pop("format_version", None)
     if version != RESULTS_FORMAT:
         raise BadInput(f"{path}: format_version {version!r}; this tosslab reads {RESULTS_FORMAT}")
@@ -348,11 +343,4 @@ class Results:
 
     def stage(self, folder: str) -> Mapping[str, Any]:
         """stage.json of a stage's folder: version, config, inputs, seconds, counts."""
-        return _read_json(self.path / folder / "stage.json")
-
-
-def _read_json(path: Path) -> Mapping[str, Any]:
-    document = read_json(path, "; remove it and run toss-process again to make it")
-    if not isinstance(document, dict):
-        raise DamagedFile(f"{path}: wanted a JSON object, found {type(document).__name__}")
-    return document
+        return stage_document(self.path / folder / "stage.json")

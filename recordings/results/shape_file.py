@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Int
 from numpy import ndarray as Array
 
-from recordings.bounded.documents import read_json
-from recordings.errors import BadInput, DamagedFile
+from recordings.errors import BadInput
+from recordings.results.stage_files import stage_document, stage_file
 from recordings.tracks import ObjectShape
 from recordings.whole_file import write_bytes, write_json
 
@@ -52,15 +52,13 @@ def read_shape(folder: Path, name: str = "shape") -> ObjectShape:
         data = path.read_bytes()
     except OSError as refused:
         raise BadInput(f"{folder} holds no {name}.ply ({refused.strerror}); run toss-process again") from refused
-    about = read_json(folder / f"{name}.json", "; remove its folder and run toss-process again")
-    try:
+    about = stage_document(folder / f"{name}.json")
+    with stage_file(path):
         end = data.index(b"end_header\n") + len(b"end_header\n")
         counts = [int(line.split()[2]) for line in data[:end].decode().splitlines() if line.startswith("element")]
         vertices = np.frombuffer(data, VERTEX, counts[0], end)
         faces = np.frombuffer(data, FACE, counts[1], end + vertices.nbytes)
         object_frame, source = str(about["object_frame"]), str(about["source"])
-    except (ValueError, IndexError, KeyError, TypeError) as wrong:
-        raise DamagedFile(f"{path} is damaged ({wrong}); remove its folder and run toss-process again") from wrong
     return ObjectShape(
         object_frame=object_frame,
         source=source,

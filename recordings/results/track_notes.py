@@ -19,9 +19,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray as Array
 
-from recordings.bounded.limits import open_npz
 from recordings.errors import BadInput, DamagedFile
 from recordings.results.folder import Results
+from recordings.results.stage_files import stage_arrays
 from recordings.whole_file import write_bytes
 
 FIT, NOTES = "toss_{:02d}.fit.npz", "toss_{:02d}.notes.npz"
@@ -99,11 +99,8 @@ def read_notes(folder: Path, toss: int) -> TrackNotes | None:
 def _arrays(path: Path) -> Mapping[str, Any]:
     if not path.exists():
         return {}
-    try:
-        with open_npz(path) as stored:
-            return {name: stored[name] for name in stored.files}
-    except (OSError, ValueError) as wrong:
-        raise DamagedFile(f"{path} cannot be read ({wrong}); remove its folder and run toss-process again") from wrong
+    with stage_arrays(path) as stored:
+        return {name: stored[name] for name in stored.files}
 
 
 def find_notes(results: Results, stage: str, toss: int) -> TrackNotes | None:

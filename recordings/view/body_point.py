@@ -25,22 +25,22 @@ def at_same_point(
 def body_point(
     scene: Scene, body: Body, toss: int, times_ns: Int64[Array, " n"], matrices: Float[Array, "n 4 4"]
 ) -> Float[Array, "3"]:
-    """The middle of the reference's shape, in the frame of `body`: where the reference has it at the body's poses, the
-    median over the toss. Without a reference, or where no pose tells, the middle of the body's own shape."""
+    """The centre of the reference's shape, in the frame of `body`: where the reference has it at the body's poses, the
+    median over the toss. Without a reference, or where no pose tells, the centre of the body's own shape."""
     reference = _reference(scene, toss)
     if reference is None or reference.name == body.name:
-        return _middle(body, toss)
+        return _center(body, toss)
     at_ns, poses = root_poses(scene, reference.poses[toss])
     known = np.isfinite(poses).all(axis=(1, 2))
     at_ns, poses = at_ns[known], poses[known]
     if len(at_ns) == 0:
-        return _middle(body, toss)
-    followed = poses[:, :3, :3] @ _middle(reference, toss) + poses[:, :3, 3]
-    told = np.isfinite(matrices).all(axis=(1, 2)) & (times_ns >= at_ns[0]) & (times_ns <= at_ns[-1])
-    if not told.any():
-        return _middle(body, toss)
-    then = np.stack([np.interp(times_ns[told], at_ns, axis) for axis in followed.T], axis=1)
-    own = np.einsum("nji,nj->ni", matrices[told, :3, :3], then - matrices[told, :3, 3])
+        return _center(body, toss)
+    followed = poses[:, :3, :3] @ _center(reference, toss) + poses[:, :3, 3]
+    known = np.isfinite(matrices).all(axis=(1, 2)) & (times_ns >= at_ns[0]) & (times_ns <= at_ns[-1])
+    if not known.any():
+        return _center(body, toss)
+    then = np.stack([np.interp(times_ns[known], at_ns, axis) for axis in followed.T], axis=1)
+    own = np.einsum("nji,nj->ni", matrices[known, :3, :3], then - matrices[known, :3, 3])
     point: Float[Array, "3"] = np.median(own, axis=0)
     return point
 
@@ -52,8 +52,8 @@ def _reference(scene: Scene, toss: int) -> Body | None:
     return next(iter([*truths, *(b for b in there if b.shown), *there]), None)
 
 
-def _middle(body: Body, toss: int) -> Float[Array, "3"]:
-    """The middle of the box around the shape, in its axes; the frame's origin where no shape is known."""
+def _center(body: Body, toss: int) -> Float[Array, "3"]:
+    """The centre of the box around the shape, in its axes; the frame's origin where no shape is known."""
     shape = body.shape(toss)
     if shape is None or len(shape.vertices_m) == 0:
         return np.zeros(3)

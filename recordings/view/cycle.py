@@ -33,7 +33,7 @@ FULL_M = 0.003
 """A surface moved by this much has the full colour: red outwards, blue inwards."""
 NOWHERE = 1e-6
 """A body is drawn this small while it has no pose: its mesh stays, which is large to log again."""
-APART = 1.5
+SPACING = 1.5
 """Distance of shapes side by side, in their largest size."""
 FIGURE_NAMES = {
     "icp_mm": "Raw depth to the drawn shape, D to D'' (mm)",
@@ -106,7 +106,7 @@ def log_shapes(clock: Clock, scene: Scene, body: Body, start_ns: int) -> None:
             clock.at(start_ns).log(f"{GHOST.format(body.name)}/object/shape", mesh)
     if all(last.get(s.name) is s.shape for s in shapes) and len(last) == len(shapes):
         return
-    step_m = APART * max((float(np.ptp(s.shape.vertices_m, axis=0).max()) for s in shapes), default=0.0)
+    step_m = SPACING * max((float(np.ptp(s.shape.vertices_m, axis=0).max()) for s in shapes), default=0.0)
     for i, shown in enumerate(shapes):
         name, kind = shown.name.split("/")
         mesh = shaded_mesh(shown.shape, (*shown.color, SOLID))
@@ -251,9 +251,9 @@ def log_ghost(clock: Clock, scene: Scene, body: Body, rollout: Rollout, track: O
     gone = np.full((1, 4, 4), np.nan)
     move(clock, f"{entity}/object", start_ns, times_ns, np.concatenate([poses[during], gone]))
     tracked = root_from_object(scene, track)
-    at_ns, apart_m = distances_m(rollout.time_ns, poses, track.time_ns, tracked)
+    at_ns, distance_m = distances_m(rollout.time_ns, poses, track.time_ns, tracked)
     if len(at_ns):
-        log_line(clock, f"ghost_mm/{body.name}", "rollout to track", body.color, at_ns, 1e3 * apart_m)
+        log_line(clock, f"ghost_mm/{body.name}", "rollout to track", body.color, at_ns, 1e3 * distance_m)
 
 
 def distances_m(
@@ -297,7 +297,7 @@ def step_views(scene: Scene) -> list[rrb.Spatial3DView]:
         if len(shapes) < 2:
             continue
         size = max(float(np.ptp(s.shape.vertices_m, axis=0).max()) for s in shapes)
-        middle = shapes[0].shape.vertices_m.mean(0) + [APART * size * (len(shapes) - 1) / 2, 0, 0]
+        middle = shapes[0].shape.vertices_m.mean(0) + [SPACING * size * (len(shapes) - 1) / 2, 0, 0]
         away = np.array([0.0, -0.6, -1.0]) * size * max(2.0, 1.25 * len(shapes))
         eye = rrb.EyeControls3D(position=middle + away, look_target=middle, eye_up=[0, -1, 0])
         grid = rrb.LineGrid3D(visible=False)

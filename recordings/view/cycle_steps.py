@@ -14,8 +14,7 @@ older run, stages that were removed) is left out.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,9 +23,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int64
 from numpy import ndarray as Array
 
-from recordings.bounded.limits import open_npz
-from recordings.errors import BadInput, DamagedFile
+from recordings.errors import BadInput
 from recordings.results.folder import Results, VariantRecord, read_shape, read_track
+from recordings.results.stage_files import stage_arrays, stage_file
 from recordings.tracks import ObjectShape, ObjectTrack
 
 ALIGNED = "aligned"
@@ -93,7 +92,7 @@ class TossCycle:
     rollout: Rollout | None
 
     @property
-    def tells_something(self) -> bool:
+    def has_passes(self) -> bool:
         """More than the result itself."""
         first = self.steps[0]
         return len(self.steps) > 1 or bool(first.learned or first.judged or self.rollout)
@@ -103,7 +102,7 @@ def read_cycle(results: Results, record: VariantRecord) -> dict[int, TossCycle]:
     """Of each toss of a variant what is known of its passes. Raises DamagedFile for files that cannot be read."""
     reader = _Reader(results, record)
     found = {t.toss: reader.toss(t.toss, t.track, t.shape or record.shape) for t in record.tosses}
-    return {t: cycle for t, cycle in found.items() if cycle.tells_something}
+    return {t: cycle for t, cycle in found.items() if cycle.has_passes}
 
 
 class _Reader:
@@ -175,7 +174,7 @@ class _Reader:
         values = self._read(path)
         if not values:
             return None
-        with _damage(path):
+        with stage_file(path):
             verdict = tuple(str(v) for v in values["verdict"])
             return Laid(verdict, values["fitness"], values["rmse_m"], values["held"].astype(np.int64))
 
@@ -187,7 +186,7 @@ class _Reader:
             if tuple(self._folder(key) for key in wanted) != (track, shape):
                 continue
             path = self._results.path / name / "residuals.npz"
-            with _damage(path):
+            with stage_file(path):
                 rows = self._read(path)["rows"]
                 mine = rows[rows[:, 0] == toss]
                 return Judged(mine[:, 1].astype(np.int64), mine[:, 2], mine[:, 3], mine[:, 4])
@@ -200,7 +199,7 @@ class _Reader:
             values, name = self._read(path), f"toss_{toss:02d}"
             if stage is None or f"{name}.time_s" not in values or len(track.time_ns) == 0:
                 continue
-            with _damage(path):
+            with stage_file(path):
                 time_ns = int(track.time_ns[0]) + np.round(1e9 * values[f"{name}.time_s"]).astype(np.int64)
                 return Rollout(time_ns, values[f"{name}.world_from_object"], self._shape(body))
         return None
@@ -240,7 +239,7 @@ class _Reader:
         if path not in self._arrays:
             self._arrays[path] = {}
             if path.exists():
-                with _damage(path), open_npz(path) as stored:
+                with stage_arrays(path) as stored:
                     self._arrays[path] = {name: stored[name] for name in stored.files}
         return self._arrays[path]
 
@@ -252,12 +251,3 @@ class _Names:
     track: str
     shape: str | None
     drawn: str | None = None
-
-
-@contextmanager
-def _damage(path: Path) -> Iterator[None]:
-    """Turns what a broken file raises into DamagedFile."""
-    try:
-        yield
-    except (OSError, ValueError, KeyError, IndexError) as wrong:
-        raise DamagedFile(f"{path} cannot be read ({wrong}); remove its folder and run toss-process again") from wrong

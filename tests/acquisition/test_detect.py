@@ -113,7 +113,7 @@ def test_what_is_new_above_the_table_is_the_object() -> None:
     seen = eye.see(0.1, raw, 0.001, None, None)
     assert still is None
     assert seen is not None
-    np.testing.assert_allclose(seen.middle_m, [0.0, 0.0, 0.3], atol=0.01)
+    np.testing.assert_allclose(seen.centroid_m, [0.0, 0.0, 0.3], atol=0.01)
     assert seen.points == 100
 
 

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import event, given, settings
+from hypothesis import strategies as st
 
 from acquisition.arm.approach import FASTEST_M_S, fastest_m_s, find_way, plan_approach
 from acquisition.arm.kinematics import Batch
@@ -58,6 +61,59 @@ def test_a_way_that_dips_below_the_table_is_not_taken(pair: tuple[list[float], l
     np.testing.assert_allclose(q[[0, -1]], [start, goal], atol=1e-9)
     assert lowest_m(q[:: len(q) // 100]) > TABLE_CLEARANCE_M - STEP_M / 2
     assert way.stops >= 1
+
+
+LAB = replace(TABLE, lower_m=np.array([-0.9, -0.9, -0.05]), upper_m=np.array([0.9, 0.9, 1.3]))
+LOW_POSES = [np.array(pose) for pair in LOW_PAIRS for pose in pair]
+
+
+def least_room_m(path_rad: np.ndarray) -> tuple[float, float]:
+    """Of the arm's moving links along a path: height over the table, and room to the box's faces, by plain forward
+    kinematics."""
+    height = room = np.inf
+    for q in path_rad:
+        a, b, radius = PANDA.segments(q)
+        moving = np.array([c.link != PANDA.robot.root for c in PANDA.capsules])
+        low, high = (np.minimum(a, b) - radius[:, None])[moving], (np.maximum(a, b) + radius[:, None])[moving]
+        height = min(height, float(low[:, 2].min()))
+        room = min(room, float((low - LAB.lower_m).min()), float((LAB.upper_m - high).min()))
+    return height, room
+
+
+def approach(start: np.ndarray, goal: np.ndarray) -> np.ndarray | str:
+    """The joints along the approach in the lab's box, or why there is none."""
+    try:
+        return plan_approach(PANDA, LAB, start, goal).trajectory.q_rad
+    except PathRefused as refused:
+        return str(refused)
+
+
+def test_an_arm_that_stands_at_its_goal_stays_there() -> None:
+    start = LOW_POSES[0]
+    way = plan_approach(PANDA, LAB, start, start)
+    np.testing.assert_array_equal(way.trajectory.q_rad, np.stack([start, start]))
+    assert way.tool_way_m == 0.0
+
+
+@settings(max_examples=8, deadline=None, derandomize=True)
+@given(
+    start=st.sampled_from(LOW_POSES),
+    goal=st.sampled_from(LOW_POSES),
+    off_rad=st.lists(st.floats(-0.25, 0.25), min_size=14, max_size=14),
+)
+def test_between_any_low_poses_an_approach_keeps_table_and_box_or_is_refused_with_the_place(
+    start: np.ndarray, goal: np.ndarray, off_rad: list[float]
+) -> None:
+    start, goal = start + off_rad[:7], goal + off_rad[7:]
+    q = approach(start, goal)
+    event("refused" if isinstance(q, str) else "accepted")
+    if isinstance(q, str):
+        assert re.search(r"distance of \S+ to .+ at \d+ % of the way|allowed are", q), q
+        return
+    np.testing.assert_allclose(q[[0, -1]], [start, goal], atol=1e-9)
+    height_m, room_m = least_room_m(q[:: max(1, len(q) // 150)])
+    assert height_m > TABLE_CLEARANCE_M - STEP_M / 2
+    assert room_m > -STEP_M / 2
 
 
 def test_where_no_way_leads_round_the_place_is_named() -> None:

@@ -239,36 +239,36 @@ def tossed(geometry, rig):
         layout[tag] = geometry.pose(turn, [0, 0, 0]) @ inward @ geometry.pose([0, 0, 0.02 * tag], [0.003, -0.002, 0])
     body = Tags("tag36h11", dict.fromkeys(layout, 0.06), layout)
     times = np.arange(24) / 30
-    course = [
+    trajectory = [
         geometry.pose([2.5 * t, 1.5 * t, 1.0 * t], [0.5 * t - 0.2, 0.1, 0.1 + 1.2 * t - 4.9 * t * t / 2]) for t in times
     ]
     names = ("mono0", "mono1", "mono2")
-    sightings = {
-        n: [seen_tags(models[n], inverse_poses(world_from[n]) @ pose, body, rng) for pose in course] for n in names
+    detections = {
+        n: [seen_tags(models[n], inverse_poses(world_from[n]) @ pose, body, rng) for pose in trajectory] for n in names
     }
-    return body, times, course, sightings
+    return body, times, trajectory, detections
 
 
 def test_layout_and_poses_of_an_unknown_tagged_body_are_found(rig, tossed):
     models, world_from, _ = rig
-    body, _, course, sightings = tossed
-    names = list(sightings)
+    body, _, trajectory, detections = tossed
+    names = list(detections)
     places = {n: inverse_poses(world_from[n]) for n in names}
-    solved = solve_tagged_object({n: models[n] for n in names}, sightings, body.size_m, places)
+    solved = solve_tagged_object({n: models[n] for n in names}, detections, body.size_m, places)
     assert solved.left_out == 0
-    assert len(solved.instants) == len(course)
+    assert len(solved.instants) == len(trajectory)
     reference = solved.tag_ids[0]
     for pose, k in zip(solved.rig_from_body, solved.instants):
-        mm, deg = off(pose, course[k] @ body.board_from_tag[reference])
+        mm, deg = off(pose, trajectory[k] @ body.board_from_tag[reference])
         assert mm < 0.6
         assert deg < 0.5
 
 
 def test_cameras_are_placed_by_the_tossed_body_alone(rig, tossed):
     models, world_from, _ = rig
-    body, _, _, sightings = tossed
-    names = sorted(sightings)
-    solved = solve_tagged_object({n: models[n] for n in names}, sightings, body.size_m)
+    body, _, _, detections = tossed
+    names = sorted(detections)
+    solved = solve_tagged_object({n: models[n] for n in names}, detections, body.size_m)
     for k, name in enumerate(names[1:], 1):
         true = inverse_poses(world_from[name]) @ world_from[names[0]]
         mm, deg = off(solved.solved.scene.camera_from_rig[k], true)
@@ -278,9 +278,9 @@ def test_cameras_are_placed_by_the_tossed_body_alone(rig, tossed):
 
 def test_a_wrong_tag_size_is_found_by_its_ratio_and_said(rig, tossed):
     models, world_from, _ = rig
-    body, _, _, sightings = tossed
-    places = {n: inverse_poses(world_from[n]) for n in sightings}
-    measured = sizes_by_triangulation({n: models[n] for n in sightings}, places, sightings)
+    body, _, _, detections = tossed
+    places = {n: inverse_poses(world_from[n]) for n in detections}
+    measured = sizes_by_triangulation({n: models[n] for n in detections}, places, detections)
     assert wrong_sizes(body.size_m, measured) == []
     (finding,) = wrong_sizes(dict.fromkeys(body.size_m, 0.066), measured)
     assert finding.level == "refused"

@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
 
+from calibration.cameras.intrinsics import calibrate_intrinsics
 from calibration.cameras.poses import angle_deg, exp_poses, inverse_poses, log_poses
 from calibration.cameras.targets import Tags
 from calibration.ground_plane import (
@@ -17,7 +19,8 @@ from calibration.ground_plane import (
     place_world,
     table_points,
 )
-from calibration.hand_eye import best_start, calibrate_hand_eye, daniilidis, missing_motion, park
+from calibration.hand_eye import LensAccuracy, calibrate_hand_eye, missing_motion
+from calibration.hand_eye_start import best_start, daniilidis, park
 from calibration.time_offset import (
     Path3,
     TimeOffset,
@@ -82,6 +85,27 @@ def test_an_arm_much_worse_than_assumed_widens_the_deviation_until_it_holds(geom
     assert said["position_mm"] > 2.0
     assert mm < 2.5 * said["position_mm"]
     assert deg < 2.5 * said["direction_deg"]
+
+
+def squared_deviations(found, true):
+    """Of place and direction in standard deviations: chi-square of 3 degrees of freedom where these are right."""
+    gap = log_poses((true @ inverse_poses(found.camera_from_mount))[None])[0]
+    return [float(gap[k] @ np.linalg.solve(found.covariance[k, k], gap[k])) for k in (slice(3, 6), slice(0, 3))]
+
+
+def test_the_interval_holds_the_camera_where_its_lens_was_fitted_on_few_noisy_corners(geometry):
+    held = {"lens as exact": 0, "lens as stated": 0}
+    for seed in range(4):
+        mounting = ("eye-to-hand", "eye-in-hand")[seed % 2]
+        model, mount, _, robot, views = arm_case(geometry, seed, mounting)
+        rng = np.random.default_rng(100 + seed)
+        board = [geometry.view(model, geometry.tilted(rng, tilt_deg=25.0), rng, sigma_px=0.5) for _ in range(8)]
+        lens = calibrate_intrinsics("d455", (848, 480), board, ("none",))
+        for name, sure in zip(held, (LensAccuracy(), LensAccuracy.stated(lens.report.uncertainty))):
+            found = calibrate_hand_eye(lens.model, views, robot, mounting, lens=sure)
+            held[name] += max(squared_deviations(found, mount)) < chi2.ppf(0.99, 3)
+    assert held["lens as stated"] == 4
+    assert held["lens as exact"] <= 1
 
 
 def test_park_and_daniilidis_are_exact_without_noise(geometry):
@@ -159,11 +183,11 @@ def test_an_offset_from_tag_corners_is_found_to_a_fraction_of_a_millisecond(geom
     model = geometry.camera("d455", 500.0, (848, 640))
     camera = geometry.pose([np.pi, 0, 0], [-0.1, 0.1, 1.5])
     frames = corner_frames(geometry, model, camera, at, times[2:-4:2] + 0.009, 0.0062, np.random.default_rng(3))
-    course = Path3.of_poses(times, poses)
+    trajectory = Path3.of_poses(times, poses)
     crooked = geometry.pose([0.001, -0.001, 0.0005], [0.001, 0.001, -0.002]) @ camera
-    found = offset_of_corners(course, model, crooked, frames)
+    found = offset_of_corners(trajectory, model, crooked, frames)
     assert abs(found.offset_s - 0.0062) < 0.0003
-    place = place_by_motion(course, model, frames)
+    place = place_by_motion(trajectory, model, frames)
     mm, deg = off(place, camera)
     assert mm < 3.0
     assert deg < 0.1
@@ -249,11 +273,11 @@ def test_gravity_comes_out_of_free_flight_of_a_point_off_the_centre(geometry):
     carried = poses.copy()
     carried[:, :3, 3] += poses[:, :3, :3] @ [0.004, -0.003, 0.002]
     carried[:, :3, 3] += 0.0002 * rng.normal(size=(len(times), 3))
-    course = Path3.of_poses(times, carried)
-    flight = find_flight(course, 0.25)
+    trajectory = Path3.of_poses(times, carried)
+    flight = find_flight(trajectory, 0.25)
     assert flight.start >= 8
     assert flight.stop <= 24 or flight.start >= 22  # before the bounce or after it, never across
-    found = gravity_from_flight(course, flight)
+    found = gravity_from_flight(trajectory, flight)
     assert np.degrees(np.arccos(-found.down[2])) < max(0.5, 3 * found.std_deg)
     assert found.size_m_s2 == pytest.approx(9.81, rel=0.02)
     level = Plane(np.array([0.0, 0, 1]), 0.0, 1e-4, 0.01)

@@ -10,11 +10,11 @@ import time
 import cv2
 import numpy as np
 import pytest
+from synthetic.infrared_dots import corner_noise_px, dots_advice, with_infrared_dots
 
 from calibration.tags import detect as tags_module
 from calibration.tags.detect import DetectorChild, DetectorDied, detect_tags
 from calibration.tags.faults import explain_absence
-from calibration.tags.infrared_dots import corner_noise_px, dots_advice
 from recordings.errors import BadInput
 
 FAMILY = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
@@ -177,8 +177,6 @@ def test_what_is_no_grey_picture_or_no_family_is_refused():
 
 
 def test_faint_infrared_dots_do_no_harm_and_strong_ones_are_named():
-    from acquisition.synthetic.render.dots import with_infrared_dots
-
     image, rng = (0.6 * drawn(7, 60.0, 2)[0]).astype(np.uint8), np.random.default_rng(0)
     without = detect_tags([image] * 2, jobs=1)
     faint = detect_tags([with_infrared_dots(image, 0.15, 12.0, rng) for _ in range(5)], jobs=1)

@@ -232,14 +232,13 @@ def test_passes_go_on_while_the_raw_images_are_explained_better_and_the_best_is_
     from processing import cycle
 
     judged = iter([0.001, -0.02, -0.01, 0.0005])
-    monkeypatch.setattr(cycle, "compared", lambda *a, **k: {"of": "x", "worse_share": next(judged), "same": False})
-    monkeypatch.setattr(cycle, "learned_from", lambda run, best, images, name, contact: (best, ()))
     count = iter(range(2, 9))
 
-    def another(*_: Any, **__: Any) -> tuple[Pass, tuple[dict[int, float], dict[int, float]]]:
-        return Pass({}, {}, shared_frame=True, notes=(f"made by pass {next(count)}",)), ({}, {})
+    def another(run: Any, best: Pass, *_: Any, **__: Any) -> tuple[Pass, Pass, dict[str, Any]]:
+        after = Pass({}, {}, shared_frame=True, notes=(f"made by pass {next(count)}",))
+        return best, after, {"of": "x", "before": {}, "worse_share": next(judged), "same": False}
 
-    monkeypatch.setattr(cycle, "judged_pass", another)
+    monkeypatch.setattr(cycle, "once_more", another)
     session = Session.open(SAMPLE)
     run = start_run(session, session.tosses, tmp_path, Config(), TRACKERS[0], lambda _: Silent())
     ended = cycle.run_cycle(run, find_variant("converged"), Pass({}, {}, shared_frame=True), {}, "x")

@@ -21,7 +21,7 @@ import pytest
 
 from processing.engine import jobs
 from processing.engine.each import InTurn, SideBySide, Task
-from processing.engine.outcome import Fault, Lost, Outcome, outcome_of, raise_if_told
+from processing.engine.outcome import Fault, Lost, Outcome, outcome_of, raise_outcome
 from processing.engine.parts import allow_threads, in_parts
 from processing.engine.workers import Worker
 from processing.store import Store
@@ -140,13 +140,13 @@ def test_an_error_of_another_process_is_the_same_error_here(wrong: Exception) ->
 
     told = json.loads(json.dumps(outcome_of(fails)))
     with pytest.raises(type(wrong)) as found:
-        raise_if_told(told)
+        raise_outcome(told)
     assert str(found.value) == str(wrong)
 
 
 def test_a_fault_of_another_process_brings_its_lines_and_is_no_users_error() -> None:
     with pytest.raises(Fault, match=r"(?s)ZeroDivisionError.*in nothing_by_zero") as found:
-        raise_if_told(outcome_of(nothing_by_zero))
+        raise_outcome(outcome_of(nothing_by_zero))
     assert not isinstance(found.value, TosslabError)
 
 

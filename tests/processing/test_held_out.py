@@ -11,7 +11,7 @@ import pytest
 import trimesh
 
 from processing.config import Config
-from processing.cycle import judged_pass, learned_from
+from processing.cycle import learned_by_halves, second_pass, with_contact
 from processing.evaluate.truth import open_truth
 from processing.field.learn import LearnConfig
 from processing.field.train import FieldConfig
@@ -20,7 +20,7 @@ from processing.passes import Pass, certain_share
 from processing.run import Run
 from processing.stages.contact import learn_contact
 from processing.stages.find import find_object
-from processing.stages.held_out import Half, halves_of, judge_by_contact, losses_of, why_no_halves
+from processing.stages.held_out import Half, halves_of, judge_by_contact, losses_of, why_not_by_contact
 from processing.stages.rig import refine_rig
 from processing.stages.scene import learn_static_scene
 from processing.stages.segment import segment
@@ -153,10 +153,12 @@ def test_no_contact_of_a_toss_is_in_the_second_pass_shape_that_it_is_judged_by(
     images = {t: raw_images(run, t, rig, segment(run, t, scene, rig, found)) for t in run.tosses}
     shapes = dict.fromkeys(true_tracks, true_shape)
     start = Pass(true_tracks, shapes, shared_frame=True, halves=halves_of(true_tracks, shapes))
-    refined, halves = learned_from(run, start, images, "test", contact=True)
+    refined = replace(with_contact(run, start, images, "test"), halves=learned_by_halves(run, start, "test"))
     assert refined.shapes[0].key != true_shape.key, "contact's shape must take part, or nothing is shown"
-    after, losses = judged_pass(run, start, refined, halves, images, "test", icp=False)
-    assert [sorted(x) for x in losses] == [list(run.tosses)] * 2
+    after = second_pass(run, refined, images, "test", icp=False)
+    for of in (refined, after):
+        losses = losses_of([judge_by_contact(run, "test", of.tracks, half) for half in of.halves])
+        assert sorted(losses) == list(run.tosses)
     for half in after.halves:
         assert half.shape.key != after.shapes[0].key
         assert half.contact is not None
@@ -193,6 +195,5 @@ def test_three_tosses_are_too_few_for_halves_and_a_session_says_so(
 ) -> None:
     few = dict(list(true_tracks.items())[:3])
     assert halves_of(few, dict.fromkeys(few, true_shape)) == ()
-    assert "fewer than 4 tosses" in why_no_halves(few, {})[0]
-    assert why_no_halves(true_tracks, dict.fromkeys(true_tracks, 1.0)) == ()
-    assert "cannot be learned from each half" in why_no_halves(true_tracks, {})[0]
+    assert "fewer than 4 tosses" in why_not_by_contact(len(few))
+    assert "cannot be learned from each half" in why_not_by_contact(len(true_tracks))

@@ -6,6 +6,7 @@ import bz2
 import hashlib
 import io
 import json
+import os
 import sqlite3
 import struct
 import zipfile
@@ -37,6 +38,20 @@ def jpeg(width: int, height: int) -> bytes:
     """A JPEG that ends behind its frame header."""
     frame = struct.pack(">BHHB", 8, height, width, 3) + bytes([1, 17, 0, 2, 17, 1, 3, 17, 1])
     return b"\xff\xd8\xff\xc0" + struct.pack(">H", len(frame) + 2) + frame + b"\xff\xd9"
+
+
+def three_gigabytes(path: Path) -> None:
+    """A file that the disk holds as a hole."""
+    path.touch()
+    os.truncate(path, 3 << 30)
+
+
+def json_of_nothing(path: Path) -> None:
+    path.write_text("{}")
+
+
+def nested_toml(path: Path) -> None:
+    path.write_text("a = " + 100_000 * "[")
 
 
 def nested_json(path: Path) -> None:

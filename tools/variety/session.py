@@ -13,11 +13,12 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray as Array
+from synthetic.folder import PIXEL_CONVENTION, STATES_HZ
 
-from acquisition.synthetic.folder import PIXEL_CONVENTION, STATES_HZ, TRUTH_SUFFIX
 from acquisition.synthetic.random_draws import small_error
 from acquisition.synthetic.render.rays import Body, Placed, Standing, cast
 from acquisition.synthetic.render.sensors import color_image
+from acquisition.synthetic.truth_sidecar import SUFFIX
 from recordings.errors import BadInput
 from recordings.geometry import CameraModel, Transform
 from recordings.progress import Progress, Silent
@@ -52,7 +53,7 @@ def make(
     spec: Spec, out: Path, objects: Path | None = None, progress: Progress | None = None, threads: int = 2
 ) -> Path:
     """Write the session; returns its truth. Raises BadInput by name where the spec cannot be shown; nothing is left."""
-    truth = out.with_name(out.name + TRUTH_SUFFIX)
+    truth = out.with_name(out.name + SUFFIX)
     for folder in (out, truth):
         if folder.exists():
             raise BadInput(f"{folder} exists; wanted a new folder: choose another name, or remove it")

@@ -24,6 +24,7 @@ STATE = row(JOINTS)
 VARIABLES = [
     *("timestamp", "target_q", "target_qd", "actual_q", "actual_qd", "target_moment"),
     *("robot_mode", "safety_mode", "robot_status_bits", "safety_status_bits", "runtime_state"),
+    *("payload", "payload_cog"),
 ]
 SILENT_S = 1.0
 """Without a new state for this long the arm counts as gone."""
@@ -47,6 +48,7 @@ class ArmLoop:
         self._stamp = -1.0
         self._came_s = time.monotonic()
         self._mode = -1
+        self._gripper = (float(receive.getPayload()), np.array(receive.getPayloadCog()))  # what the panel was told
         self.follower: Follower | None = None
 
     def run(self) -> None:
@@ -72,9 +74,25 @@ class ArmLoop:
                 self.follower.brake()
         elif message["do"] == "recover":
             self._end.event("answer", reason=self._recover())
+        elif message["do"] == "load":
+            self._end.event("answer", reason=self._load(message["mass"], message["centre"]))
         elif message["do"] == "check":
             self._end.event("answer", reason=self._unfit())
         return message["do"] != "quit"
+
+    def _load(self, mass_kg: float, centre_flange_m: list[float]) -> str:
+        """`set_payload` of the control script: the panel's payload and this one together. A controller that does not
+        take it ends the script."""
+        if self.follower is not None:
+            return "a motion is under way"
+        own_kg, own_at = self._gripper
+        both_kg = own_kg + mass_kg
+        at = (own_kg * own_at + mass_kg * np.array(centre_flange_m)) / max(both_kg, 1e-9)
+        try:
+            taken = self._control.setPayload(both_kg, at.tolist()) and self._control.isProgramRunning()
+        except RuntimeError as error:
+            return str(error)
+        return "" if taken else self._stop_reason() or "its controller refuses set_payload: more than it carries?"
 
     def _unfit(self) -> str:
         """What the dashboard says against a motion: the safety mode, the panel's control."""
@@ -204,8 +222,8 @@ class Follower:
             return self._over("aborted", self._stop_reason() or "the controller takes no more positions")
         if self._brake is not None and self._brake.standing:
             return self._over("aborted", "halted")
-        settled = self._place > len(self._path) + 3 * self._options["lookahead_s"] * self._rate_hz
-        return self._over("done", "") if settled else False
+        arrived = self._place > len(self._path) + 3 * self._options["lookahead_s"] * self._rate_hz
+        return self._over("done", "") if arrived else False
 
     def _servo(self, q: Float[Array, "6"]) -> bool:
         options = self._options

@@ -138,15 +138,16 @@ class Forecasts:
 
     def energies(self, wanted: Sequence[Law]) -> tuple[Float[Array, "m n k"], Float[Array, "m n k"]]:
         """Energy score and mean distance in metres, per law, toss and frame; 0 where a toss has ended."""
-        laws = np.array([[w.friction, w.restitution, w.unexplained] for w in wanted])
+        laws = np.array([[w.friction, w.restitution] for w in wanted])
+        unexplained = np.array([w.unexplained for w in wanted])[:, None, None]
         parts = [np.repeat(p[None], len(laws), 0) for p in self._start]
         longest = max(len(c.time_s) for c in self.trajectories)
         energy, off = (np.zeros((len(laws), len(self.trajectories), longest)) for _ in range(2))
         for k in range(1, longest):
             going = [j for j, c in enumerate(self.trajectories) if k < len(c.time_s)]
             dt = np.array([self.trajectories[j].time_s[k] - self.trajectories[j].time_s[k - 1] for j in going])
-            moved, push = _rolled([p[:, going] for p in parts], dt, self.body, laws[:, :2])
-            self._kick(moved, laws[:, 2, None, None] * push, dt, k)
+            moved, push = _rolled([p[:, going] for p in parts], dt, self.body, laws)
+            self._kick(moved, unexplained * push, dt, k)
             for whole, part in zip(parts, moved):
                 whole[:, going] = part
             seen = [self.trajectories[j] for j in going]
@@ -223,15 +224,15 @@ def _add(covariance: Float[Array, "*b 12 12"], rows: slice, columns: slice, valu
 def _predicted(states: _States, dt: Float[Array, " a"], body: RigidBody, laws: Float[Array, "m 2"]) -> _States:
     """The states after dt: their sigma points rolled on."""
     rolled, _ = _rolled(_members(states), dt, body, laws)
-    middle = rolled[0][:, :, 0].copy()
+    rotation = rolled[0][:, :, 0].copy()
     for _ in range(2):
-        middle = middle @ rotation_matrices(_turns(middle, rolled[0]).mean(2))
-    turns = _turns(middle, rolled[0])
+        rotation = rotation @ rotation_matrices(_rotation_vectors(rotation, rolled[0]).mean(2))
+    turns = _rotation_vectors(rotation, rolled[0])
     position, spin, velocity = means = [values.mean(2) for values in rolled[1:]]
     parts = [turns - turns.mean(2, keepdims=True), *(v - mean[:, :, None] for v, mean in zip(rolled[1:], means))]
     error = np.concatenate(parts, -1)
     covariance = np.einsum("masi,masj->maij", error, error) / MEMBERS
-    return _States(middle, position, spin, velocity, covariance)
+    return _States(rotation, position, spin, velocity, covariance)
 
 
 def _rolled(
@@ -305,6 +306,6 @@ def _corrected(
     )
 
 
-def _turns(middle: Float[Array, "m a 3 3"], rotation: Float[Array, "m a s 3 3"]) -> Float[Array, "m a s 3"]:
+def _rotation_vectors(mean: Float[Array, "m a 3 3"], rotation: Float[Array, "m a s 3 3"]) -> Float[Array, "m a s 3"]:
     """Rotation vectors from the middle to each."""
-    return rotation_vectors(np.swapaxes(middle, -1, -2)[:, :, None] @ rotation)
+    return rotation_vectors(np.swapaxes(mean, -1, -2)[:, :, None] @ rotation)

@@ -56,6 +56,6 @@ def plane_by_forecasts(
 
 def _larger(corners_m: Float[Array, "8 3"], by_m: float) -> Float[Array, "8 3"]:
     """The box with every face moved outwards."""
-    middle = corners_m.mean(0)
-    half = corners_m - middle
-    return middle + np.sign(half) * np.maximum(np.abs(half) + by_m, LEAST_HALF_M)
+    center = corners_m.mean(0)
+    half = corners_m - center
+    return center + np.sign(half) * np.maximum(np.abs(half) + by_m, LEAST_HALF_M)

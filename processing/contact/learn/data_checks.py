@@ -7,7 +7,8 @@ plane.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -76,9 +77,9 @@ def measured_fall(tosses: Sequence[PoseSeries]) -> Fall | None:
     if len(found) < 3:
         return None
     values, errors = np.array([f.value for f in found]), np.array([f.error for f in found])
-    middle = float(np.median(values))
-    spread = MAD_TO_SIGMA * float(np.median(np.abs(values - middle)))  # at 30 Hz some windows are bounces, and scatter
-    return Fall(middle, 1.25 * max(spread, float(np.sqrt((errors**2).mean()))) / len(found) ** 0.5)
+    median = float(np.median(values))
+    spread = MAD_TO_SIGMA * float(np.median(np.abs(values - median)))  # at 30 Hz some windows are bounces, and scatter
+    return Fall(median, 1.25 * max(spread, float(np.sqrt((errors**2).mean()))) / len(found) ** 0.5)
 
 
 def _falls(series: PoseSeries) -> list[Fall]:
@@ -120,6 +121,24 @@ def _parabola(series: PoseSeries, first: int, frames: int, noise_m: float) -> tu
     return left, Fall(float(fit[2, 2]), error)
 
 
+class Contradiction(BadInput):
+    """Poses that break a law of mechanics. Imported ones were read wrongly, which the message says; `of_own_tracks` is
+    what to say where they are vision's: nobody read them wrongly, so something that was measured is off."""
+
+    def __init__(self, message: str, of_own_tracks: str) -> None:
+        super().__init__(message)
+        self.of_own_tracks = of_own_tracks
+
+
+@contextmanager
+def of_own_tracks() -> Iterator[None]:
+    """Around all that learns from vision's own tracks: what is said of a contradiction is what is true of those."""
+    try:
+        yield
+    except Contradiction as wrong:
+        raise BadInput(wrong.of_own_tracks) from wrong
+
+
 def check_fall(tosses: Sequence[PoseSeries]) -> float | None:
     """The acceleration of free fall. Raises BadInput where it is not gravity's, beyond its own error: the step or the
     scale is wrong."""
@@ -131,12 +150,15 @@ def check_fall(tosses: Sequence[PoseSeries]) -> float | None:
         return fall
     if fall > 0:
         raise BadInput(f"free fall accelerates upwards ({fall:.2f} m/s^2): z of `world` must point up, against gravity")
-    step = tosses[0].step_s
-    raise BadInput(
-        f"free fall reads {-fall:.2f} m/s^2 instead of {GRAVITY_M_S2}: either the time step is wrong ({step * 1e3:.3f} "
-        "ms is said, "
-        f"{step * 1e3 * (-fall / GRAVITY_M_S2) ** 0.5:.3f} ms would fit) or the scale (1 m in the data would be "
-        f"{GRAVITY_M_S2 / -fall:.4f} m); import it again with the right `--dt` or `--scale`"
+    step, scale = tosses[0].step_s, GRAVITY_M_S2 / -fall
+    reads = f"free fall reads {-fall:.2f} m/s^2 instead of {GRAVITY_M_S2} (+- {found.error:.2f})"
+    raise Contradiction(
+        f"{reads}: either the time step is wrong ({step * 1e3:.3f} ms is said, {step * 1e3 / scale**0.5:.3f} ms would "
+        f"fit) or the scale (1 m in the data would be {scale:.4f} m); import it again with the right `--dt` or "
+        "`--scale`",
+        f"{reads} in the tracks: most likely depth is scaled (by {1 / scale:.3f}; `toss-calibrate table SESSION` "
+        f"measures it), less likely the frames' stamps are (a frame lasts {step * 1e3:.2f} ms by them, "
+        f"{step * 1e3 / scale**0.5:.2f} ms would fit: `toss-session verify SESSION`)",
     )
 
 
@@ -171,23 +193,6 @@ def impact_angle(tosses: Sequence[PoseSeries], inertia: Float[Array, "3 3"]) -> 
     return (across / along if along > 0 else 0.0), count
 
 
-class OtherReading(BadInput):
-    """Impacts that fit the orientations only when these are read in another way. `of_own_tracks` is what to say where
-    the poses are vision's: nobody read them wrongly, so they are off."""
-
-    def __init__(self, misfit: float, other: float, reading: str) -> None:
-        super().__init__(
-            f"impacts do not fit the orientations (misfit {misfit:.2f}), but they do ({other:.2f}) when the rotations "
-            f"are {reading}; import the data again in that reading"
-        )
-        self.of_own_tracks = (
-            f"at impacts the tracked object does not turn as a rigid body that is hit would (misfit {misfit:.2f}, "
-            "wanted below 0.3): most likely its orientation is off (blur, or an object that looks alike from several "
-            "sides: look at the impacts with `toss-view`), less likely the table's place is (`toss-calibrate table "
-            "SESSION`)"
-        )
-
-
 def check_orientations(tosses: Sequence[PoseSeries], inertia: Float[Array, "3 3"]) -> float:
     """How far impacts are from a right angle (0..1). Raises BadInput where another reading of the rotations fits
     far better."""
@@ -197,7 +202,14 @@ def check_orientations(tosses: Sequence[PoseSeries], inertia: Float[Array, "3 3"
     for name, read in READINGS.items():
         other, _ = impact_angle([read(s) for s in tosses], inertia)
         if here > 0.3 and other < 0.6 * here:
-            raise OtherReading(here, other, name)
+            raise Contradiction(
+                f"impacts do not fit the orientations (misfit {here:.2f}), but they do ({other:.2f}) when the "
+                f"rotations are {name}; import the data again in that reading",
+                f"at impacts the tracked object does not turn as a rigid body that is hit would (misfit {here:.2f}, "
+                "wanted below 0.3): most likely its orientation is off (blur, or an object that looks alike from "
+                "several sides: look at the impacts with `toss-view`), less likely the table's place is "
+                "(`toss-calibrate table SESSION`)",
+            )
     return here
 
 

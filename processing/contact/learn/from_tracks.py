@@ -13,7 +13,7 @@ from numpy import ndarray as Array
 
 from processing.contact.fuse import Field, FusionConfig, Readings, Sizes, Surface, likely_sizes, thinned
 from processing.contact.learn.convexity import ClassName, GeometryChoice, choose_geometry, measured_prior, start_points
-from processing.contact.learn.data_checks import OtherReading, check_plane, lowest_point_m
+from processing.contact.learn.data_checks import check_plane, lowest_point_m, of_own_tracks
 from processing.contact.learn.fit import FRICTION, Model, fit_lbfgs
 from processing.contact.learn.learn import (
     ContactConfig,
@@ -109,10 +109,8 @@ def learn_from_tracks(
     series = [s for s in series_of(tracks, world_from_camera) if s.toss not in left_out]
     if not series:
         raise BadInput("no toss can be learned from: " + "; ".join(f"toss {t}: {why}" for t, why in left_out.items()))
-    try:
+    with of_own_tracks():
         return learn_from_series(series, shape, plane, physics, config, progress, left_out)
-    except OtherReading as wrong:
-        raise BadInput(wrong.of_own_tracks) from wrong
 
 
 def learn_from_series(

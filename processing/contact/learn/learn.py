@@ -128,9 +128,9 @@ def learn_contact(
     data = StepData(steps, config.fit.device)
     started = time.process_time()
     fits = [fit(fitted, fitted.start(), data, weights)]
-    odd = unexplained_rows(data, fitted.numbers(fits[0].parameters), prior.geometry.contacts)
-    if bool(odd.any()):
-        data.weight[odd] = 0.0
+    unexplained = unexplained_rows(data, fitted.numbers(fits[0].parameters), prior.geometry.contacts)
+    if bool(unexplained.any()):
+        data.weight[unexplained] = 0.0
         fits.append(fit(fitted, fits[0].parameters, data, weights))
     optimum = fits[-1].parameters
     slow = slow_friction(fitted, optimum, prepared, config)
@@ -165,7 +165,7 @@ def learn_contact(
         left_out=left_out,
         duplicates=tuple(groups),
         transitions=len(steps),
-        unexplained=_by_toss(steps, odd.cpu().numpy()),
+        unexplained=_by_toss(steps, unexplained.cpu().numpy()),
         solver_failures=fits[-1].last_failures,
         touched=touched,
         plane_sensitivity=sensitivity,
@@ -328,10 +328,10 @@ def touched_points(fitted: Model, body: Body, data: StepData, weights: Weights) 
     return touched
 
 
-def _by_toss(steps: Steps, odd: Bool[Array, " n"]) -> dict[int, tuple[int, ...]]:
+def _by_toss(steps: Steps, unexplained: Bool[Array, " n"]) -> dict[int, tuple[int, ...]]:
     """Frames of the transitions that were left out, by toss."""
     found: dict[int, list[int]] = {}
-    for toss, frame in zip(steps.toss[odd].tolist(), steps.frame[odd].tolist()):
+    for toss, frame in zip(steps.toss[unexplained].tolist(), steps.frame[unexplained].tolist()):
         found.setdefault(toss, []).append(frame)
     return {toss: tuple(frames) for toss, frames in found.items()}
 

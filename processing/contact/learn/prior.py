@@ -93,8 +93,8 @@ def prior_from_shape(
     center = physics.center_of_mass_m
     if geometry == "box":
         around = shape.vertices_m if cap_m2 == 0 else trimmed_vertices(shape.vertices_m, shape.faces, cap_m2)
-        axes, middle, half = _oriented_box(around)
-        return Prior(Box(half), Frame(axes, middle), True, shape.object_frame, shape)
+        axes, center, half = _oriented_box(around)
+        return Prior(Box(half), Frame(axes, center), True, shape.object_frame, shape)
     frame = Frame(np.eye(3), center)
     local = frame.inside(shape.vertices_m)
     free: FreePoints

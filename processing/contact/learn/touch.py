@@ -104,8 +104,8 @@ def touches(track: PoseSeries, release: int, name: int) -> Touches:
     load = np.zeros(len(track))
     load[1:-1] = np.diff(speed) / (0.5 * (dt[1:] + dt[:-1])) / GRAVITY_M_S2 + 1
     carried = (load > LEAST_LOAD_G) & (load < MOST_LOAD_G)
-    beside = (load > LEAST_LOAD_G) & (load < 2 * MOST_LOAD_G)
-    carried[1:-1] &= beside[:-2] & beside[2:]
+    bearing = (load > LEAST_LOAD_G) & (load < 2 * MOST_LOAD_G)
+    carried[1:-1] &= bearing[:-2] & bearing[2:]
     up, kept = track.rotation[:, 2], list[int]()
     for k in np.flatnonzero(carried[release + 1 : -1]) + release + 1:
         if not kept or up[k] @ up[kept[-1]] < np.cos(TURNED_RAD):

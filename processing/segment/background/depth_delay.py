@@ -90,13 +90,13 @@ def outline_shifts(
 ) -> OutlineShifts:
     """Of the frames of one toss in which the object moves steadily or not at all; `masks`: where it is, roughly."""
     speeds = _steady_speeds(frames.times_ns, masks, s)
-    ways, told = [], []
+    ways, speeds_there = [], []
     for i in _chosen(np.linalg.norm(speeds, axis=1), s):
         way = _way(frames[i], masks[i], scene, float(np.linalg.norm(speeds[i])), s)
         if way is not None:
             ways.append(way)
-            told.append(speeds[i])
-    return OutlineShifts(np.array(ways).reshape(-1, 2), np.array(told).reshape(-1, 2))
+            speeds_there.append(speeds[i])
+    return OutlineShifts(np.array(ways).reshape(-1, 2), np.array(speeds_there).reshape(-1, 2))
 
 
 def _steady_speeds(

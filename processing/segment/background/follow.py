@@ -91,7 +91,7 @@ class Found:
 
 
 @dataclass(frozen=True, eq=False)
-class Beside:
+class RobotCues:
     """What the robot's drawing adds: log-odds of the object's colours against the robot's, and where the scene is
     unknown though no robot stands there."""
 
@@ -138,7 +138,7 @@ def follow(
     scene: StaticScene,
     memory: Memory,
     block: Bool[Array, "h w"] | None,
-    beside: Beside | None,
+    cues: RobotCues | None,
     s: BackgroundSettings,
 ) -> Found:
     """The mask in the next frame; empty with confidence 0 where the object is not found."""
@@ -160,28 +160,28 @@ def follow(
     if block is not None:
         moved &= ~block
     rough = component_in(moved, near)
-    if beside is not None:
-        rough |= _other_pieces(frame, moved & ~rough, expected, beside, memory, s)
+    if cues is not None:
+        rough |= _other_pieces(frame, moved & ~rough, expected, cues, memory, s)
     others = moved & near & ~grown(rough, 3)
     others_px = int(others.sum())
     if rough.sum() < s.least_px:
         return Found(np.zeros_like(rough), 0.0, others_px, False)
     wide = grown(rough, 5)
-    unknown = ~scene.known if beside is None else beside.unknown
+    unknown = ~scene.known if cues is None else cues.unknown
     if not memory.others_near:  # where nothing else is near, depth before the table suffices
         unknown = unknown & (scene.depth_m == 0)
     strange = (wide & unknown).sum() > s.unknown * rough.sum()
     larger = rough.sum() > s.grown * area
     if strange or (larger and not _is_all_object(frame, rough, expected, memory, far_px, s)):
-        rough = _among_others(frame, scene, moved, expected, memory, beside, s)
+        rough = _among_others(frame, scene, moved, expected, memory, cues, s)
         if rough.sum() < s.least_px:
             return Found(np.zeros_like(rough), 0.0, others_px, True)
         mask, sure = rough, 0.6
     else:
-        least = None if beside is None else s.piece_px
+        least = None if cues is None else s.piece_px
         bare = None if scene.known[wide].all() else np.where(scene.known, 0, memory.likeness.log_odds(frame.color_rgb))
         # where the scene's colour is known, it decides; the robot's colours speak against the object only
-        odds = bare if beside is None else np.where(scene.known, np.minimum(beside.odds, 0), beside.odds)
+        odds = bare if cues is None else np.where(scene.known, np.minimum(cues.odds, 0), cues.odds)
         mask, sure = refine_border(frame, scene, rough, odds, s.foreground, least)
     if block is not None:
         mask = mask & ~block
@@ -256,7 +256,7 @@ def _other_pieces(
     frame: RgbdFrame,
     moved: Bool[Array, "h w"],
     expected: Bool[Array, "h w"],
-    beside: Beside,
+    cues: RobotCues,
     memory: Memory,
     s: BackgroundSettings,
 ) -> Bool[Array, "h w"]:
@@ -275,8 +275,8 @@ def _other_pieces(
         piece = np.asarray(labels == k)
         depth = frame.depth_m[piece & (frame.depth_m > 0)]
         inside = len(depth) > 0 and low - s.depth_margin_m < float(np.median(depth)) < high + s.depth_margin_m
-        close = beside.odds[piece] != 0
-        alike = close.any() and float(beside.odds[piece][close].mean()) > 0
+        close = cues.odds[piece] != 0
+        alike = close.any() and float(cues.odds[piece][close].mean()) > 0
         if inside and alike and whole[piece].mean() > 0.6:
             out |= piece
     return out
@@ -288,7 +288,7 @@ def _among_others(
     moved: Bool[Array, "h w"],
     expected: Bool[Array, "h w"],
     memory: Memory,
-    beside: Beside | None,
+    cues: RobotCues | None,
     s: BackgroundSettings,
 ) -> Bool[Array, "h w"]:
     """The object among other things that are not scene either: by its colours, its depth and where it is expected."""
@@ -302,8 +302,8 @@ def _among_others(
     depth, (low, high) = frame.depth_m[at], memory.depth_range_m
     elsewhere = (depth > 0) & ((depth < low - s.depth_margin_m) | (depth > high + s.depth_margin_m))
     likeness = memory.likeness.log_odds(frame.color_rgb[at], crowded=True)
-    if beside is not None:
-        likeness = np.minimum(likeness, np.where(beside.odds[at] != 0, beside.odds[at], likeness))
+    if cues is not None:
+        likeness = np.minimum(likeness, np.where(cues.odds[at] != 0, cues.odds[at], likeness))
     odds = not_scene + s.foreground.weight_likeness * likeness + place - 4.0 * elsewhere
     odds = np.where(moved[at], odds, np.minimum(odds, -1.0)).astype(np.float32)
     belief = smooth(odds, frame.color_rgb[at].astype(np.float32), s.foreground)

@@ -150,8 +150,8 @@ def _color_votes(
     for kind in (other, ~other & ~like, ~other & like):
         # the object's border may show any of its colours, and most likely those nearby
         anywhere = (float((kind & core).sum()) + s.unseen_px / 3) / (float(core.sum()) + s.unseen_px)
-        beside = (_nearby(kind & core, around_px) + s.unseen_px * anywhere) / (_nearby(core, around_px) + s.unseen_px)
-        inside = np.maximum(anywhere, beside)
+        around = (_nearby(kind & core, around_px) + s.unseen_px * anywhere) / (_nearby(core, around_px) + s.unseen_px)
+        inside = np.maximum(anywhere, around)
         outside = (_nearby(kind & ring, around_px) + s.unseen_px / 3) / (_nearby(ring, around_px) + s.unseen_px)
         out = np.where(kind, np.log(inside / outside).clip(-s.weight_color, s.weight_color), out)
     sure = np.where(other, _sure(hue, at_hue), np.where(like, _sure(plain, at_plain), 1.0))
@@ -194,11 +194,11 @@ def _fattened(
 
 
 def _vote(
-    hits: Bool[Array, "a b"], core: Bool[Array, "a b"], seen: float, beside: Bool[Array, "a b"], s: ForegroundSettings
+    hits: Bool[Array, "a b"], core: Bool[Array, "a b"], seen: float, around: Bool[Array, "a b"], s: ForegroundSettings
 ) -> float:
     """Log-odds of the object, of what `hits` of its core and `seen` of the scene's pixels beside it show."""
     own = (float(hits.sum()) + s.unseen_px / 3) / (float(core.sum()) + s.unseen_px)
-    other = (seen + s.unseen_px / 3) / (float(beside.sum()) + s.unseen_px)
+    other = (seen + s.unseen_px / 3) / (float(around.sum()) + s.unseen_px)
     return float(np.clip(np.log(own / other), -s.weight_depth, s.weight_depth))
 
 

@@ -15,9 +15,9 @@ from numpy import ndarray as Array
 
 from processing.segment.background.follow import (
     BackgroundSettings,
-    Beside,
     Found,
     Memory,
+    RobotCues,
     component_in,
     follow,
     reach_px,
@@ -210,8 +210,8 @@ class BackgroundSegmenter:
         scene = scene if lit else colorless(scene)
         certain = seen.certain & (odds < OBJECT_LIKE)
         certain = certain if block is None else certain | block
-        beside = Beside(odds, unknown)
-        return follow(frame, with_robot(scene, frame, seen, s), memory, certain, beside, self._settings)
+        cues = RobotCues(odds, unknown)
+        return follow(frame, with_robot(scene, frame, seen, s), memory, certain, cues, self._settings)
 
     def _scene_without(self, frame: RgbdFrame, mask: Bool[Array, "h w"]) -> StaticScene:
         moved = moved_pixels(frame, self._scene, self._settings.foreground)

@@ -16,6 +16,7 @@ from recordings.constants import MAD_TO_SIGMA_SHORT
 from recordings.errors import BadInput
 from recordings.geometry import CameraModel, Transform
 from recordings.records import RgbdFrame
+from recordings.results.stage_files import stage_arrays
 from recordings.tracks import RigCalibration
 
 
@@ -77,7 +78,7 @@ class StaticScene:
     @staticmethod
     def read(folder: Path) -> StaticScene:
         """From a stage's folder."""
-        with np.load(folder / "scene.npz", allow_pickle=False) as stored:
+        with stage_arrays(folder / "scene.npz") as stored:
             return StaticScene(**stored)
 
 

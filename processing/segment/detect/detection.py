@@ -18,8 +18,11 @@ from processing.segment.detect.candidates import Candidate, CandidateSettings, F
 from processing.segment.detect.tracklets import Appearance, Tracklet, TrackletSettings, alike, choose, join
 from processing.segment.robot.frames import CoarseFrames, RobotFrames
 from processing.segment.segmenter import Example
+from recordings.bounded.limits import read_npy
 from recordings.geometry import CameraModel
+from recordings.mcap.codec import decode_mask
 from recordings.records import RgbdFrame
+from recordings.results.stage_files import stage_document, stage_file
 
 
 @dataclass(frozen=True)
@@ -205,12 +208,15 @@ def write_detections(folder: Path, found: Mapping[int, Detection]) -> None:
 
 def read_detection(folder: Path, toss: int) -> Detection | None:
     """One toss's, from a stage's folder; None where the object was not found in it."""
-    entry = json.loads((folder / "sightings.json").read_text()).get(str(toss))
+    path, shares_path = folder / "sightings.json", folder / "shares.npy"
+    entry = stage_document(path).get(str(toss))
     if entry is None:
         return None
     files = sorted((folder / f"toss_{toss:02d}").glob("*.png"))
-    masks = {int(f.stem): np.asarray(np.asarray(cv2.imread(str(f), cv2.IMREAD_GRAYSCALE)) > 0) for f in files}
-    shares = np.load(folder / "shares.npy", allow_pickle=False)
-    spans = {int(i): (int(first), int(last)) for i, (first, last) in entry["spans"].items()}
-    elsewhere = tuple((int(first), int(last)) for first, last in entry["elsewhere"])
-    return Detection(int(entry["start"]), masks, spans, shares, float(entry["score"]), elsewhere)
+    with stage_file(shares_path):
+        shares = read_npy(shares_path)
+    with stage_file(path):
+        masks = {int(f.stem): decode_mask(f.read_bytes(), f.name) for f in files}
+        spans = {int(i): (int(first), int(last)) for i, (first, last) in entry["spans"].items()}
+        elsewhere = tuple((int(first), int(last)) for first, last in entry["elsewhere"])
+        return Detection(int(entry["start"]), masks, spans, shares, float(entry["score"]), elsewhere)

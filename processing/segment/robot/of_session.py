@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -16,6 +15,7 @@ from processing.segment.background.foreground import kernel
 from processing.segment.robot.render import RobotView
 from recordings.errors import BadInput
 from recordings.geometry import CameraModel, Transform
+from recordings.results.stage_files import stage_document, stage_file
 from recordings.robot.arm import PANDA_TOOL, ArmPath, panda
 from recordings.session import Session
 
@@ -38,11 +38,13 @@ class Rig:
     @staticmethod
     def read(folder: Path) -> Rig:
         """From a finished stage's folder."""
-        stored = json.loads((folder / "rig.json").read_text())
-        matrix = stored["camera_from_base"]
-        base = None if matrix is None else Transform.from_matrix(CAMERA, BASE, np.array(matrix))
-        estimate = [float("nan") if stored[k] is None else float(stored[k]) for k in ("estimated_scale", "scale_sigma")]
-        return Rig(base, float(stored["arm_delay_s"]), float(stored["depth_scale"]), *estimate)
+        path = folder / "rig.json"
+        stored = stage_document(path)
+        with stage_file(path):
+            matrix, scale = stored["camera_from_base"], [stored[k] for k in ("estimated_scale", "scale_sigma")]
+            base = None if matrix is None else Transform.from_matrix(CAMERA, BASE, np.array(matrix))
+            estimate = [float("nan") if x is None else float(x) for x in scale]
+            return Rig(base, float(stored["arm_delay_s"]), float(stored["depth_scale"]), *estimate)
 
 
 class RobotOfSession:

@@ -49,12 +49,12 @@ class Encoded:
 class Bottleneck(nn.Module):
     """Residual block of ResNet50 (He et al. 2016), the stride at its 3x3 convolution."""
 
-    def __init__(self, inward: int, middle: int, stride: int) -> None:
+    def __init__(self, inward: int, width: int, stride: int) -> None:
         super().__init__()
-        outward = 4 * middle
-        self.conv1, self.bn1 = nn.Conv2d(inward, middle, 1, bias=False), nn.BatchNorm2d(middle)
-        self.conv2, self.bn2 = nn.Conv2d(middle, middle, 3, stride, 1, bias=False), nn.BatchNorm2d(middle)
-        self.conv3, self.bn3 = nn.Conv2d(middle, outward, 1, bias=False), nn.BatchNorm2d(outward)
+        outward = 4 * width
+        self.conv1, self.bn1 = nn.Conv2d(inward, width, 1, bias=False), nn.BatchNorm2d(width)
+        self.conv2, self.bn2 = nn.Conv2d(width, width, 3, stride, 1, bias=False), nn.BatchNorm2d(width)
+        self.conv3, self.bn3 = nn.Conv2d(width, outward, 1, bias=False), nn.BatchNorm2d(outward)
         self.downsample = _shortcut(inward, outward, stride)
 
     def forward(self, x: Tensor) -> Tensor:
@@ -83,9 +83,9 @@ def _shortcut(inward: int, outward: int, stride: int) -> nn.Module:
     return nn.Sequential(nn.Conv2d(inward, outward, 1, stride, bias=False), nn.BatchNorm2d(outward))
 
 
-def _bottlenecks(inward: int, middle: int, count: int, stride: int) -> nn.Sequential:
-    rest = [Bottleneck(4 * middle, middle, 1) for _ in range(count - 1)]
-    return nn.Sequential(Bottleneck(inward, middle, stride), *rest)
+def _bottlenecks(inward: int, width: int, count: int, stride: int) -> nn.Sequential:
+    rest = [Bottleneck(4 * width, width, 1) for _ in range(count - 1)]
+    return nn.Sequential(Bottleneck(inward, width, stride), *rest)
 
 
 def _basics(inward: int, outward: int, count: int, stride: int) -> nn.Sequential:
@@ -205,12 +205,12 @@ class HiddenReinforce(nn.Module):
 class HiddenUpdate(nn.Module):
     """The update of the sensory memory in every frame, from the decoder's features at three strides."""
 
-    def __init__(self, widths: tuple[int, int, int], middle: int, hidden: int) -> None:
+    def __init__(self, widths: tuple[int, int, int], width: int, hidden: int) -> None:
         super().__init__()
-        self.g16_conv = nn.Conv2d(widths[0], middle, 1)
-        self.g8_conv = nn.Conv2d(widths[1], middle, 1)
-        self.g4_conv = nn.Conv2d(widths[2], middle, 1)
-        self.transform = nn.Conv2d(middle + hidden, 3 * hidden, 3, padding=1)
+        self.g16_conv = nn.Conv2d(widths[0], width, 1)
+        self.g8_conv = nn.Conv2d(widths[1], width, 1)
+        self.g4_conv = nn.Conv2d(widths[2], width, 1)
+        self.transform = nn.Conv2d(width + hidden, 3 * hidden, 3, padding=1)
 
     def forward(self, g16: Tensor, g8: Tensor, g4: Tensor, hidden: Tensor) -> Tensor:
         seen = self.g16_conv(g16) + self.g8_conv(F.avg_pool2d(g8, 2)) + self.g4_conv(F.avg_pool2d(g4, 4))

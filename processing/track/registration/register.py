@@ -264,11 +264,11 @@ def _refined(
     # keyframes are far apart in time: the pull towards free flight has no meaning between them
     motion = Motion(keyframes.frame.astype(np.float64), np.arange(len(poses)), np.zeros(3), keyframes.center_m, none)
     graph = replace(config.joint, spread_in_time=1)
-    beside = (
+    priors = (
         replace(keyframes.support_plane, views=np.flatnonzero(use)),
         ConsistencyTerms.of(keyframes, rims, use, config.consistency),
     )
-    return refine(keyframes.store, poses, use, fixed, motion, graph, tied=tied, beside=beside).poses
+    return refine(keyframes.store, poses, use, fixed, motion, graph, tied=tied, priors=priors).poses
 
 
 def _moved_track(

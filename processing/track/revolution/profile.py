@@ -74,7 +74,7 @@ class RoundBody:
         self.axis, self.config = axis, config
         self._store, self._views = store, np.flatnonzero(use)
         self._axes = np.stack([*across(axis), axis.direction])
-        self._beside_px = _beside_px(store, self._views)
+        self._outline_distance_px = _outline_distance_px(store, self._views)
         self._pixels = {int(i): _pixels(store, int(i)) for i in self._views}
         self._before: tuple[Array, ...] | None = None
         self._outline = np.zeros((len(self._views), 3))
@@ -190,7 +190,7 @@ class RoundBody:
             out = H[n], g[n], cross[n], Hyy, gy
             rk.surface_terms(samples, poses[i], *axis, *profile, settings, scale, weight, *out)
             self._outline[n] = rk.outline_terms(
-                self._beside_px,
+                self._outline_distance_px,
                 row,
                 rectified.focal,
                 rectified.center,
@@ -238,18 +238,20 @@ def is_round(
     return body.outline_share > config.round_share
 
 
-def _beside_px(store: ViewStore, views: Int[Array, " v"]) -> Float32[Array, " p"]:
+def _outline_distance_px(store: ViewStore, views: Int[Array, " v"]) -> Float32[Array, " p"]:
     """Distance to the rim of the mask, negative inside, a little smooth; far where something may cover the object."""
     out = np.full(len(store.maps), FAR_PX, dtype=np.float32)
     for i in views:
         crop = store.crops[i]
         assert crop is not None  # a view in use has one
         inside = crop.mask.astype(np.uint8)
-        beside = cv2.distanceTransform(1 - inside, cv2.DIST_L2, 5) - cv2.distanceTransform(inside, cv2.DIST_L2, 5)
-        beside = cv2.GaussianBlur(np.where(inside > 0, beside + 0.5, beside - 0.5).astype(np.float32), (0, 0), 1.0)
-        beside[cv2.dilate(crop.covered.astype(np.uint8), np.ones((7, 7))) > 0] = FAR_PX
+        distance = cv2.distanceTransform(1 - inside, cv2.DIST_L2, 5) - cv2.distanceTransform(inside, cv2.DIST_L2, 5)
+        distance = cv2.GaussianBlur(
+            np.where(inside > 0, distance + 0.5, distance - 0.5).astype(np.float32), (0, 0), 1.0
+        )
+        distance[cv2.dilate(crop.covered.astype(np.uint8), np.ones((7, 7))) > 0] = FAR_PX
         first = int(store.table[i, lay.OFFSET])
-        out[first : first + inside.size] = beside.ravel()
+        out[first : first + inside.size] = distance.ravel()
     return out
 
 

@@ -133,7 +133,7 @@ def outline_points(pose, axes, point, y, seen, sizes, config, out):
         cx += axes[0, a] * c[a]
         cy += axes[1, a] * c[a]
         ch += axes[2, a] * c[a]
-    beside, towards = max(np.sqrt(cx * cx + cy * cy), 1e-6), np.arctan2(cy, cx)
+    off_axis, towards = max(np.sqrt(cx * cx + cy * cy), 1e-6), np.arctan2(cy, cx)
     n = 0
     steps = max(int((high - low) / config[APART_PX]), 2)
     for s in range(steps):
@@ -141,7 +141,7 @@ def outline_points(pose, axes, point, y, seen, sizes, config, out):
         r, slope, j, t, known = _curve(y, seen, sizes, OUTSIDE, (h - config[FIRST_HEIGHT]) / row)
         r += grown
         # a normal across the ray: cos(angle) = (r - r' (h - h_camera)) / distance of the camera from the axis
-        cosine = (r - min(max(slope / row, -1.0), 1.0) * (h - ch)) / beside
+        cosine = (r - min(max(slope / row, -1.0), 1.0) * (h - ch)) / off_axis
         if not known or abs(cosine) >= 1.0:
             continue
         for sign in (-1.0, 1.0):
@@ -155,7 +155,7 @@ def outline_points(pose, axes, point, y, seen, sizes, config, out):
         cap = sign * (ch - h) > 0.0
         for s in range(RING):
             angle = 2.0 * np.pi * s / RING
-            if (beside * np.cos(angle - towards) - r > 0.0) != cap:  # of wall and cap the camera sees one
+            if (off_axis * np.cos(angle - towards) - r > 0.0) != cap:  # of wall and cap the camera sees one
                 out[n, 0], out[n, 1], out[n, 2] = h, r, angle
                 out[n, 3], out[n, 4], out[n, 5] = j, t, end + 1.0
                 n += 1
@@ -175,7 +175,7 @@ def _place(found, axes, point, pose, P, rad, X):
 
 @no_type_check
 @njit(cache=True, nogil=True, fastmath=True)
-def _rim(beside_px, off, w, h, u, v, out):
+def _rim(distance_px, off, w, h, u, v, out):
     """Distance to the mask's rim at (u, v) of a view and its slopes, into out[2:5]; False beyond the crop."""
     out[0], out[1] = u, v
     if not (u > 1 and v > 1 and u < w - 3 and v < h - 3):
@@ -183,7 +183,7 @@ def _rim(beside_px, off, w, h, u, v, out):
     ju, jv = int(np.floor(u)), int(np.floor(v))
     a, b = u - ju, v - jv
     q = off + jv * w + ju
-    s00, s10, s01, s11 = beside_px[q], beside_px[q + 1], beside_px[q + w], beside_px[q + w + 1]
+    s00, s10, s01, s11 = distance_px[q], distance_px[q + 1], distance_px[q + w], distance_px[q + w + 1]
     out[2] = (s00 * (1 - a) + s10 * a) * (1 - b) + (s01 * (1 - a) + s11 * a) * b
     out[3] = (s10 - s00) * (1 - b) + (s11 - s01) * b
     out[4] = (s01 - s00) * (1 - a) + (s11 - s10) * a
@@ -210,7 +210,7 @@ def _odd_points(rim, usable, config):
 @no_type_check
 @njit(cache=True, nogil=True, fastmath=True)
 def outline_terms(
-    beside_px, table, focal, center, pose, axes, point, y, seen, sizes, config, weight, H, g, Hy, Hyy, gy
+    distance_px, table, focal, center, pose, axes, point, y, seen, sizes, config, weight, H, g, Hy, Hyy, gy
 ):
     """Adds one view's outline. beside_px: distance to the mask's rim (negative inside; far where it may be covered) of
     all views' pixels. Returns how many points count, of how many, and the sum of their squared residuals (px^2)."""
@@ -221,7 +221,7 @@ def outline_terms(
     for s in range(n):
         _place(found[s], axes, point, pose, P, rad, X)
         u, v = focal[0] * X[0] / X[2] + center[0] - table[U0], focal[1] * X[1] / X[2] + center[1] - table[V0]
-        usable[s] = _rim(beside_px, table[OFFSET], table[WIDTH], table[HEIGHT], u, v, rim[s])
+        usable[s] = _rim(distance_px, table[OFFSET], table[WIDTH], table[HEIGHT], u, v, rim[s])
         rim[s, 2] -= y[BIAS]
     odd = _odd_points(rim, usable, config)
     count, total, ny = 0, 0.0, len(y)

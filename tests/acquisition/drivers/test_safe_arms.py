@@ -15,7 +15,7 @@ from acquisition.arm.limits import arm_model
 from acquisition.arm.thrower import ArmThrower
 from acquisition.arm.workspace import Space
 from acquisition.cli import main
-from acquisition.devices import ArmSamples, DeviceRefused, JointTrajectory
+from acquisition.devices import ArmSamples, DeviceRefused, JointTrajectory, TakesLoad
 from acquisition.drivers import franka
 from acquisition.drivers.franka import FrankaArm
 from acquisition.drivers.ur import UrArm
@@ -40,6 +40,25 @@ def rest(arm: FrankaArm | UrArm) -> np.ndarray:
 
 def small_way(name: str, q: np.ndarray) -> JointTrajectory:
     return plan_approach(arm_model(name), SPACE, q, q + np.linspace(0.03, -0.03, len(q))).trajectory
+
+
+def test_a_ur_is_told_its_load_and_a_load_that_its_controller_refuses_is_named(rtde: tuple[str, ChildProcess]) -> None:
+    address, simulator = rtde
+    with UrArm(host=address) as arm:
+        assert isinstance(arm, TakesLoad)
+        gripper_kg, *gripper_at = simulator.snapshot()["payload"]
+        assert gripper_kg > 0
+        held_at = np.array([0.0, 0.01, 0.11])
+        arm.set_load(0.4, held_at, 0.05)
+        both = gripper_kg + 0.4
+        at = (gripper_kg * np.array(gripper_at) + 0.4 * held_at) / both
+        np.testing.assert_allclose(simulator.snapshot()["payload"], [both, *at])
+        with pytest.raises(DeviceRefused, match="the load of 9 kg was not taken: .*refuses set_payload"):
+            arm.set_load(9.0, np.zeros(3), 0.05)
+        assert simulator.snapshot()["payload"][0] == both
+        arm.recover()
+        arm.set_load(0.0, np.zeros(3), 0.0)
+        np.testing.assert_allclose(simulator.snapshot()["payload"], [gripper_kg, *gripper_at])
 
 
 def test_a_panda_is_told_its_thresholds_and_its_load(fci: tuple[str, ChildProcess]) -> None:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from synthetic.scene import frame_times
 
 from acquisition.synthetic.config import ContactConfig, ObjectConfig
 from acquisition.synthetic.lab import Lab
 from acquisition.synthetic.motion import Release, unseen_hand
 from acquisition.synthetic.objects.shapes import build, mass_properties
 from acquisition.synthetic.physics import Table
-from acquisition.synthetic.random_draws import frame_times
 from recordings.errors import BadInput
 from recordings.geometry import Transform, rotation_angle_rad, rotation_exp
 

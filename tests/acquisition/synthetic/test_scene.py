@@ -8,13 +8,12 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from synthetic.folder import write_session
+from synthetic.presets import PRESETS, SAMPLE, SAMPLE_TOSSES, described, preset
+from synthetic.scene import brightness_over_time, simulate
 
 from acquisition.synthetic.config import ErrorConfig
-from acquisition.synthetic.folder import write_session
 from acquisition.synthetic.lab import Lab
-from acquisition.synthetic.presets import PRESETS, SAMPLE, SAMPLE_TOSSES, described, preset
-from acquisition.synthetic.random_draws import brightness_over_time
-from acquisition.synthetic.scene import simulate
 from recordings.errors import BadInput
 from recordings.geometry import rotation_angle_rad
 

@@ -72,6 +72,35 @@ def test_a_poses_only_session_is_learned_from_and_all_files_are_written(poses_se
     assert again["cpu_seconds"] == document["cpu_seconds"]
 
 
+@pytest.mark.parametrize("of_vision", [True, False])
+def test_own_tracks_that_break_a_law_are_said_to_be_off_and_only_imported_poses_to_be_imported_again(
+    poses_session, real_tosses, tmp_path, monkeypatch, of_vision
+):
+    inverse = [replace(t, rotation=np.swapaxes(t.rotation, 1, 2).copy()) for t in real_tosses(range(3, 10))]
+    turned = [replace(t, velocity_world_m_s=None, spin_object_rad_s=None) for t in inverse]
+    source = PoseSource("track of variant ours", turned, None, of_vision=of_vision)
+    monkeypatch.setattr("processing.contact_command.find_poses", lambda *_: source)
+    with pytest.raises(BadInput) as refused:
+        contact_only(poses_session, tmp_path / "out", train="3-8", test="9", geometry="box", init_m=0.05, steps=20)
+    assert ("import the data again" in str(refused.value)) is not of_vision
+    assert ("its orientation is off" in str(refused.value)) is of_vision
+
+
+@pytest.mark.parametrize("of_vision", [True, False])
+def test_tracks_that_fall_too_slowly_are_said_to_be_scaled_and_only_imported_poses_to_be_imported_again(
+    poses_session, simulated_tosses, tmp_path, monkeypatch, of_vision
+):
+    slow = [
+        replace(t, toss=n, position_m=0.8 * t.position_m) for n, t in zip((3, 4, 7, 8, 9), simulated_tosses(5, 130))
+    ]
+    source = PoseSource("track of variant ours", slow, None, of_vision=of_vision)
+    monkeypatch.setattr("processing.contact_command.find_poses", lambda *_: source)
+    with pytest.raises(BadInput, match="free fall reads 7.8") as refused:
+        contact_only(poses_session, tmp_path / "out", train="3-8", test="9", geometry="box", init_m=0.05, steps=20)
+    assert ("import it again" in str(refused.value)) is not of_vision
+    assert ("most likely depth is scaled (by 0.8" in str(refused.value)) is of_vision
+
+
 def test_the_imported_poses_are_the_track(poses_session, tmp_path):
     source = find_poses(poses_session, tmp_path / "out", None, [3, 4])
     assert [t.toss for t in source.tracks] == [3, 4]

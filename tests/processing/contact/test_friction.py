@@ -1,5 +1,6 @@
 from dataclasses import replace
 
+import numba
 import numpy as np
 import pytest
 
@@ -48,6 +49,23 @@ def test_of_frictions_at_30_hz_under_noise_the_true_one_forecasts_best(simulated
     found = Forecasts(trajectories, rigid_box, Noise(1e-3, np.radians(0.5))).scores(laws)
     assert found.shape == (5, 6)
     assert found.sum(1).argmin() == 2
+
+
+def test_forecasts_and_rollouts_call_the_kernel_with_one_signature(simulated_tosses, rigid_box, box_body, monkeypatch):
+    """Every further one is compiled anew, which takes ten seconds."""
+    signatures = set()
+
+    def recorded(*arguments):
+        signatures.add(tuple(numba.typeof(a) for a in arguments))
+        return roll_rows(*arguments)
+
+    monkeypatch.setattr("processing.contact.physics.steps_cpu.roll_rows", recorded)
+    tosses = [t.part(slice(0, 40, 5)) for t in simulated_tosses(2, 130)]
+    trajectories = [ObservedTrajectory(t.time_s, t.rotation, t.position_m, 3) for t in tosses]
+    Forecasts(trajectories, rigid_box, Noise(1e-3, np.radians(0.5))).scores([Law(0.2, 0.1, 0.05), Law(0.3, 0.0, 0.05)])
+    start = Start(*(x[None] for x in (np.eye(3), np.array([0.0, 0.0, 0.2]), np.zeros(3), np.zeros(3))))
+    simulate_law(box_body, 4, Law(0.2, 0.1, 0.05), start, 2, 1 / 148)
+    assert len(signatures) == 1
 
 
 def test_two_tosses_are_too_few(simulated_tosses, rigid_box, box_physics):

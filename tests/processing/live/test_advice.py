@@ -25,16 +25,16 @@ def still(rotation: np.ndarray, frames: int = 6) -> ObjectTrack:
 
 
 def test_a_frame_tells_of_the_side_that_faces_the_camera_and_of_no_other() -> None:
-    told = sides_of(still(np.eye(3)), CENTER, None, None).told
+    information = sides_of(still(np.eye(3)), CENTER, None, None).information
     facing = directions() @ np.array([0, 0, -1.0])
-    assert (told[facing > 0.5] > 0).all()
-    assert (told[facing < 0.2] == 0).all()
-    assert directions()[told.argmax()] @ np.array([0, 0, -1.0]) > 0.98
+    assert (information[facing > 0.5] > 0).all()
+    assert (information[facing < 0.2] == 0).all()
+    assert directions()[information.argmax()] @ np.array([0, 0, -1.0]) > 0.98
 
 
 def test_nothing_seen_leaves_the_guess_and_more_frames_only_help() -> None:
     assert surface_sigma_m(np.zeros(DIRECTIONS), EXTENT_M) == GUESS * EXTENT_M
-    one, two = (sides_of(still(np.eye(3), n), CENTER, None, None).told for n in (2, 8))
+    one, two = (sides_of(still(np.eye(3), n), CENTER, None, None).information for n in (2, 8))
     assert surface_sigma_m(two, EXTENT_M) < surface_sigma_m(one, EXTENT_M) < GUESS * EXTENT_M
 
 
@@ -45,7 +45,7 @@ def test_the_best_start_shows_the_side_that_nobody_saw() -> None:
     assert starts[0].unseen
     assert not expected["faces the camera"].unseen or not expected["is up"].unseen
     assert expected["lies on the table"].sigma_m < expected["is up"].sigma_m
-    assert starts[0].sigma_m < surface_sigma_m(seen.told, EXTENT_M)
+    assert starts[0].sigma_m < surface_sigma_m(seen.information, EXTENT_M)
 
 
 def test_a_side_is_touched_where_it_pointed_down_after_the_impact() -> None:
@@ -57,8 +57,8 @@ def test_a_side_is_touched_where_it_pointed_down_after_the_impact() -> None:
     assert not sides_of(track, CENTER, WORLD_FROM_CAMERA, None).touched.any()
 
 
-def law(told: dict[int, float]) -> LawSoFar:
-    return LawSoFar(0.3, 0.1, 0.1, 0.2, told)
+def law(information: dict[int, float]) -> LawSoFar:
+    return LawSoFar(0.3, 0.1, 0.1, 0.2, information)
 
 
 def test_one_more_toss_like_the_only_one_shrinks_its_deviation_by_one_over_root_two() -> None:

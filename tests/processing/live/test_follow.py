@@ -42,8 +42,8 @@ def going_on(session: Path) -> Path:
 
 
 def follow_quickly(session: Path, **options: object) -> tuple[Followed, list[str]]:
-    told: list[str] = []
-    return follow(session, Config(), lambda _: Silent(), told.append, live=QUICK, **options), told  # type: ignore[arg-type]
+    said: list[str] = []
+    return follow(session, Config(), lambda _: Silent(), said.append, live=QUICK, **options), said  # type: ignore[arg-type]
 
 
 def test_only_whole_files_are_finished_tosses(record_tiny: Callable[..., Path]) -> None:
@@ -70,15 +70,15 @@ def test_a_session_has_ended_when_its_stop_document_is_written(record_tiny: Call
 def test_each_toss_is_judged_and_placed_and_the_recording_stays_as_it_is(record_tiny: Callable[..., Path]) -> None:
     session = record_tiny(tosses=(0, 1))
     before = {path.name: path.read_bytes() for path in session.glob("*.*")}
-    found, told = follow_quickly(session)
+    found, said = follow_quickly(session)
     assert found == Followed(looked_at=[0, 1])
     tosses = read_tosses(session)
     assert [(t.toss, t.placed) for t in tosses] == [(0, True), (1, True)]
     assert all(t.tracked >= 6 and len(t.camera_from_object) == t.frames for t in tosses)
     assert (live_folder(session) / "shape.ply").exists()
     assert [line.kind for line in LineReader(session).new()].count("verdict") == 2
-    assert any(text.startswith("toss 0: ") for text in told)
-    assert any("Next: " in text for text in told)
+    assert any(text.startswith("toss 0: ") for text in said)
+    assert any("Next: " in text for text in said)
     assert {path.name: path.read_bytes() for path in session.glob("*.*")} == before
     state = read_state(session)
     assert state is not None
@@ -96,10 +96,10 @@ def test_a_toss_that_is_taken_away_while_it_is_looked_at_is_left_out(
         return look(self, toss, file, step)  # type: ignore[arg-type]
 
     monkeypatch.setattr(Looker, "look", discarding)
-    found, told = follow_quickly(session)
+    found, said = follow_quickly(session)
     assert found.looked_at == [1]
     assert not found.failed
-    assert "toss 0 was taken away while it was looked at: left out of everything so far" in told
+    assert "toss 0 was taken away while it was looked at: left out of everything so far" in said
     assert [t.toss for t in read_tosses(session)] == [1]
 
 
@@ -110,9 +110,9 @@ def test_a_toss_that_cannot_be_looked_at_is_said_and_the_others_go_on(
         raise BadInput(f"nothing to see in {toss}")
 
     monkeypatch.setattr(Looker, "look", failing)
-    found, told = follow_quickly(record_tiny(tosses=(0, 1), frames=4))
+    found, said = follow_quickly(record_tiny(tosses=(0, 1), frames=4))
     assert found.failed == {0: "nothing to see in 0", 1: "nothing to see in 1"}
-    assert "toss 1: nothing to see in 1" in told
+    assert "toss 1: nothing to see in 1" in said
 
 
 def test_too_little_memory_ends_the_following_and_says_so(
@@ -135,8 +135,8 @@ def test_without_a_calibrated_table_that_is_said_once(
     session = record_tiny(tosses=(0,), frames=4)
     calibration = json.loads((session / "calibration.json").read_text())
     (session / "calibration.json").write_text(json.dumps({**calibration, "transforms": []}))
-    _, told = follow_quickly(session)
-    assert told.count(following.NO_TABLE) == 1
+    _, said = follow_quickly(session)
+    assert said.count(following.NO_TABLE) == 1
 
 
 def test_a_recorder_that_is_gone_ends_the_following(record_tiny: Callable[..., Path]) -> None:
@@ -171,8 +171,8 @@ def test_a_machine_that_is_too_slow_says_by_how_much_it_is_behind(
         following._Follower, "_look_at", lambda self, toss, file, waiting: self.done.update({toss: file})
     )
     monkeypatch.setattr(following._Follower, "_waited_s", lambda self, file: 90.0)
-    _, told = follow_quickly(record_tiny(tosses=(0, 1, 2), frames=4))
-    assert [text for text in told if "behind" in text] == [
+    _, said = follow_quickly(record_tiny(tosses=(0, 1, 2), frames=4))
+    assert [text for text in said if "behind" in text] == [
         "live: 90 s behind, 3 tosses wait; recording goes on as before"
     ]
 

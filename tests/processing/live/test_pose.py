@@ -68,9 +68,9 @@ def test_a_pose_comes_back_from_its_line_and_its_file(tiny_world, tmp_path: Path
     pose[:3, 3] = (0.1, 0.2, 0.7)
     seen = LivePose(4, 123_000_000, pose, 1e-4 * np.eye(6), "tracked", 0.03)
     lost = LivePose(5, 156_000_000, None, np.full((6, 6), np.nan), "lost", float("nan"))
-    told = json.loads(pose_line(seen, "d455", 12.3456))
-    assert told["position_m"] == [0.1, 0.2, 0.7]
-    assert told["latency_ms"] == 12.35
+    said = json.loads(pose_line(seen, "d455", 12.3456))
+    assert said["position_m"] == [0.1, 0.2, 0.7]
+    assert said["latency_ms"] == 12.35
     assert json.loads(pose_line(lost, "d455", 1.0))["position_m"] is None
     with PoseFile(tmp_path / "pose.mcap", RigCalibration({"d455": tiny_world.camera}), "d455") as file:
         file.write(seen)

@@ -128,10 +128,10 @@ def test_rim_points_lie_on_the_outline() -> None:
     crop = both.both.keyframes.store.crops[view]
     assert crop is not None
     at = np.round(v - crop.corner[1]).astype(int), np.round(u - crop.corner[0]).astype(int)
-    beside = (~crop.mask[at[0] - 1, at[1]]) | (~crop.mask[at[0] + 1, at[1]])
-    beside |= (~crop.mask[at[0], at[1] - 1]) | (~crop.mask[at[0], at[1] + 1])
+    at_edge = (~crop.mask[at[0] - 1, at[1]]) | (~crop.mask[at[0] + 1, at[1]])
+    at_edge |= (~crop.mask[at[0], at[1] - 1]) | (~crop.mask[at[0], at[1] + 1])
     assert crop.mask[at].all()
-    assert beside.mean() > 0.6  # the others touch the background by a corner
+    assert at_edge.mean() > 0.6  # the others touch the background by a corner
     assert row[0] >= 0
 
 

@@ -2,43 +2,39 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, UInt8, UInt16
+from jaxtyping import Bool, Float, UInt8
 from numpy import ndarray as Array
 
-from acquisition.synthetic import physics
 from acquisition.synthetic.board import board_pose, board_tags
 from acquisition.synthetic.lab import Lab
-from acquisition.synthetic.objects.paint import PaintedMesh
 from acquisition.synthetic.random_draws import BOARD, generator
-from acquisition.synthetic.scene import SyntheticToss, simulate
+from acquisition.synthetic.truth_sidecar import SUFFIX, TAG_FAMILY, write_document, write_png, write_truth_of_lab
 from recordings.errors import BadInput, WriteFailed
 from recordings.geometry import CameraModel, Transform
 from recordings.progress import Progress, Silent
+from synthetic.scene import SyntheticToss, simulate
 
 TRUTH_DEPTH_UNIT_M = 0.0001
 STATES_HZ = 148.0
-TRUTH_SUFFIX = "_truth"
 PIXEL_CONVENTION = "OpenCV: centre of pixel (0,0) is at (0,0)"
-TAG_FAMILY = "tag36h11"
 
 
 def write_session(lab: Lab, tosses: Sequence[int], out: Path, progress: Progress | None = None) -> Path:
     """Simulate `tosses` into the new folder `out`, truth into `out` + '_truth' (returned)."""
     progress = progress or Silent()
-    truth = out.with_name(out.name + TRUTH_SUFFIX)
+    truth = out.with_name(out.name + SUFFIX)
     for folder in (out, truth):
         if folder.exists():
             raise BadInput(f"{folder} exists; wanted a new folder: choose another name, or remove it")
     for folder in (out, truth):
         folder.mkdir(parents=True)
-    _write_json(out / "session.json", session_document(lab))
+    write_document(out / "session.json", session_document(lab))
     boards = write_mono_cameras(lab, out) if lab.config.mono else []
     write_truth_of_lab(lab, truth, boards)
     for done, number in enumerate(tosses):
@@ -99,66 +95,18 @@ def write_mono_cameras(lab: Lab, out: Path) -> list[Transform]:
             "frame": "board centre, z out of the printed side; tag frame as pupil-apriltags reports it",
             "tags": tags,
         }
-    _write_json(out / "mono" / "cameras.json", document)
+    write_document(out / "mono" / "cameras.json", document)
     rng = generator(lab.config.seed, BOARD)
     poses = [board_pose(rng) for _ in range(lab.mono_config.board_views)]
     for number, pose in enumerate(poses):
         view = out / "calibration" / f"view_{number:02d}"
         view.mkdir(parents=True)
         color, depth, monos = lab.board_view(number, pose)
-        _write_png(view / "rgb.png", color[..., ::-1])
-        _write_png(view / "depth.png", depth)
+        write_png(view / "rgb.png", color[..., ::-1])
+        write_png(view / "depth.png", depth)
         for camera, image in zip(lab.mono_views, monos):
-            _write_png(view / f"{camera.camera.frame}.png", image)
+            write_png(view / f"{camera.camera.frame}.png", image)
     return poses
-
-
-def write_truth_of_lab(lab: Lab, truth: Path, boards: Sequence[Transform]) -> None:
-    """mesh.obj with its texture, physics.json, object_tags.json, calibration.json, sensor_truth.json."""
-    _write_mesh(lab.object.mesh, truth)
-    config = lab.config
-    _write_json(
-        truth / "physics.json",
-        {
-            "mass_kg": lab.mass.mass_kg,
-            "inertia_body_kgm2": lab.mass.inertia_kgm2.tolist(),
-            "com_in_mesh_frame": lab.mass.center_m.tolist(),
-            "friction_mu": config.contact.friction,
-            "torsional_friction_m": config.contact.torsional_friction_m,
-            "contact_time_constant_s": config.contact.time_constant_s,
-            "contact_damping_ratio": config.contact.damping_ratio,
-            "gravity": config.contact.gravity_m_s2,
-            "source": physics.SOURCE,
-        },
-    )
-    if lab.object_tags:
-        tags = [
-            {"id": t.tag_id, "size_m": t.size_m, "face": t.face, "T_object_tag": t.object_from_tag.matrix.tolist()}
-            for t in lab.object_tags
-        ]
-        convention = "T_object_tag: frame as pupil-apriltags reports it (x right, y down, z into the face)"
-        _write_json(truth / "object_tags.json", {"family": TAG_FAMILY, "convention": convention, "tags": tags})
-    d455_from_world = lab.world_from_d455.inverse()
-    monos = {v.camera.frame: v.world_from_camera for v in lab.mono_views}
-    calibration: dict[str, Any] = {
-        "T_world_mono": {name: pose.matrix.tolist() for name, pose in monos.items()},
-        "T_d455_mono": {name: (d455_from_world @ pose).matrix.tolist() for name, pose in monos.items()},
-        "T_world_d455": lab.world_from_d455.matrix.tolist(),
-        "T_world_board": [pose.matrix.tolist() for pose in boards],
-    }
-    if lab.arm is not None:
-        calibration["T_world_base"] = lab.arm.world_from_base.matrix.tolist()
-    _write_json(truth / "calibration.json", calibration)
-    _write_json(
-        truth / "sensor_truth.json",
-        {
-            "depth_scale": config.depth.scale,
-            "depth_delay_s": config.depth.delay_s,
-            "exposure_s": config.color.exposure_s,
-            "T_world_camera": lab.world_from_d455.matrix.tolist(),
-            "arm_clock_offset_s": config.arm.clock_offset_s if config.arm else 0.0,
-        },
-    )
 
 
 def write_toss(lab: Lab, toss: SyntheticToss, out: Path, truth: Path) -> None:
@@ -169,21 +117,21 @@ def write_toss(lab: Lab, toss: SyntheticToss, out: Path, truth: Path) -> None:
         folder.mkdir(parents=True)
     for k, frame in enumerate(toss.frames):
         _write_jpeg(here / "rgb" / f"{k:06d}.jpg", frame.color_rgb, lab.config.color.jpeg_quality)
-        _write_png(here / "depth" / f"{k:06d}.png", frame.depth_raw)
-        _write_png(there / "masks" / f"{k:06d}.png", _mask_picture(frame.mask))
+        write_png(here / "depth" / f"{k:06d}.png", frame.depth_raw)
+        write_png(there / "masks" / f"{k:06d}.png", _mask_picture(frame.mask))
         exact = np.round(frame.depth_exact_object_m / TRUTH_DEPTH_UNIT_M).astype(np.uint16)
-        _write_png(there / "depth_exact_object" / f"{k:06d}.png", exact)
+        write_png(there / "depth_exact_object" / f"{k:06d}.png", exact)
         if frame.robot_mask is not None:
             (there / "robot_masks").mkdir(exist_ok=True)
-            _write_png(there / "robot_masks" / f"{k:06d}.png", _mask_picture(frame.robot_mask))
-    _write_png(here / "mask_first.png", _mask_picture(toss.frames[0].mask))
+            write_png(there / "robot_masks" / f"{k:06d}.png", _mask_picture(frame.robot_mask))
+    write_png(here / "mask_first.png", _mask_picture(toss.frames[0].mask))
     _write_times(here / "timestamps.txt", [f.time_s for f in toss.frames])
     if lab.config.depth.delay_s != 0:
         _write_times(here / "depth_timestamps.txt", [f.depth_time_s for f in toss.frames])
     document: dict[str, Any] = {"frames": len(toss.frames)}
     if lab.config.say_release:
         document["release_time_s"] = toss.motion.instants.release_s
-    _write_json(here / "toss.json", document)
+    write_document(here / "toss.json", document)
     if toss.arm_states is not None:
         _write_arm(here / "arm.csv", toss.arm_states)
     if toss.mono:
@@ -230,7 +178,7 @@ def _write_truth_poses(lab: Lab, toss: SyntheticToss, there: Path) -> None:
         nominal_frame=np.array([f.nominal for f in toss.frames]),
     )
     np.savez_compressed(there / "states_148hz.npz", **_states(toss))
-    _write_json(
+    write_document(
         there / "toss_gt.json",
         {
             "source_toss": "simulated",
@@ -275,22 +223,6 @@ def _intrinsics(camera: CameraModel) -> dict[str, Any]:
     }
 
 
-def _write_mesh(mesh: PaintedMesh, folder: Path) -> None:
-    """Wavefront OBJ with an sRGB texture (v axis up, as OBJ wants it)."""
-    from acquisition.synthetic.render.sensors import color_image
-
-    _write_png(folder / "texture.png", color_image(mesh.atlas)[..., ::-1])
-    (folder / "texture.mtl").write_text("newmtl texture\nKd 1 1 1\nmap_Kd texture.png\n")
-    height, width = mesh.atlas.shape[:2]
-    uv = (mesh.corner_uv_px.reshape(-1, 2) + 0.5) / [width, height]
-    lines = ["mtllib texture.mtl", "usemtl texture"]
-    lines += [f"v {x:.7f} {y:.7f} {z:.7f}" for x, y, z in mesh.vertices_m]
-    lines += [f"vt {u:.6f} {1 - v:.6f}" for u, v in uv]
-    for k, face in enumerate(mesh.faces):
-        lines.append("f " + " ".join(f"{vertex + 1}/{3 * k + i + 1}" for i, vertex in enumerate(face)))
-    (folder / "mesh.obj").write_text("\n".join(lines) + "\n")
-
-
 def _mask_picture(mask: Bool[Array, "h w"]) -> UInt8[Array, "h w"]:
     return np.where(mask, 255, 0).astype(np.uint8)
 
@@ -299,16 +231,7 @@ def _write_times(path: Path, times_s: Sequence[float]) -> None:
     path.write_text("".join(f"{t:.6f}\n" for t in times_s))
 
 
-def _write_png(path: Path, image: UInt8[Array, "..."] | UInt16[Array, "..."]) -> None:
-    if not cv2.imwrite(str(path), image, [cv2.IMWRITE_PNG_COMPRESSION, 6]):
-        raise WriteFailed(f"{path}: cannot be written; is there space on the disk?")
-
-
 def _write_jpeg(path: Path, image: UInt8[Array, "..."], quality: int) -> None:
     bgr = image[..., ::-1] if image.ndim == 3 else image
     if not cv2.imwrite(str(path), bgr, [cv2.IMWRITE_JPEG_QUALITY, quality]):
         raise WriteFailed(f"{path}: cannot be written; is there space on the disk?")
-
-
-def _write_json(path: Path, document: dict[str, Any]) -> None:
-    path.write_text(json.dumps(document, indent=1) + "\n")

@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 import pytest
 
-from processing import pipeline
+from processing import first_pass
 from processing.config import Config
+from processing.first_pass import _left, kept_apart
 from processing.images import Images, TossImages
-from processing.one_shape import _left, kept_apart
 from processing.run import Run
 from processing.stages.fuse import fuse_frames
 from processing.stages.register import RegisterResult
@@ -29,7 +29,7 @@ from recordings.tracks import ObjectTrack
 def stages(
     tiny_world: Any, run: Run, folder: Path, turned: int | None, narrower_px: int = 0
 ) -> tuple[Done, dict[int, Images]]:
-    """True poses as the stage of all tosses, one of them turned about the object's middle, and true masks (or narrower
+    """True poses as the stage of all tosses, one of them turned about the object's centre, and true masks (or narrower
     ones)."""
     tracks, images = folder / "register-0", {}
     tracks.mkdir(parents=True)
@@ -103,8 +103,8 @@ def test_the_others_are_joined_anew_without_a_toss_that_is_kept_apart(
         return tuple(t for t in joined if t == 1)
 
     for name, fake in (("register", register), ("learn_field", field), ("kept_apart", apart)):
-        monkeypatch.setattr(pipeline, name, fake)
-    found = pipeline.first_pass(run, alone, {})
+        monkeypatch.setattr(first_pass, name, fake)
+    found = first_pass.first_pass(run, alone, {})
     assert {t: d.key for t, d in found.tracks.items()} == {0: "together [0, 2]", 2: "together [0, 2]"}
     assert {d.key for d in found.shapes.values()} == {"all tosses [0, 2]"}
     assert not found.shared_frame

@@ -16,7 +16,7 @@ from numpy import ndarray as Array
 from acquisition.synthetic.config import SceneConfig
 from acquisition.synthetic.lab import Lab
 from acquisition.synthetic.planner import Motion
-from acquisition.synthetic.random_draws import ARM_NOISE, brightness_over_time, frame_times, generator
+from acquisition.synthetic.random_draws import ARM_NOISE, COLOR, TIMES, generator
 from recordings.geometry import Transform
 from recordings.progress import Progress, Silent
 
@@ -81,6 +81,26 @@ def simulate(
     if lab.arm is not None and motion.swing is not None:
         states = lab.arm.states(motion.swing, end_s, generator(config.seed, ARM_NOISE, toss))
     return SyntheticToss(motion, tuple(frames), tuple(dropped), _mono_shots(lab, motion), states)
+
+
+def brightness_over_time(config: SceneConfig, toss: int, times_s: Float[Array, " n"]) -> Float[Array, " n"]:
+    """Brightness of each frame against the first exposure setting: slow waves, `drift` at the most."""
+    rng = generator(config.seed, COLOR, toss)
+    wave = np.zeros_like(times_s)
+    for shortest_s, longest_s in ((1.0, 2.5), (0.6, 1.2)):
+        wave += np.sin(2 * np.pi * times_s / rng.uniform(shortest_s, longest_s) + rng.uniform(0, 2 * np.pi))
+    return 1 + config.color.drift * wave / max(float(np.abs(wave).max()), 1e-9)
+
+
+def frame_times(config: SceneConfig, toss: int, end_s: float) -> tuple[Float[Array, " n"], list[int], list[int]]:
+    """Mid-exposure times of the nominal grid with jitter (the first is 0), which frames are kept, which dropped."""
+    rng = generator(config.seed, TIMES, toss)
+    count = int(end_s * config.camera.fps) + 1
+    times = np.arange(count) / config.camera.fps + config.camera.time_jitter_s * rng.standard_normal(count)
+    times[0] = 0.0
+    lost = rng.random(count) < config.camera.dropped_share
+    lost[[0, -1]] = False
+    return times, np.flatnonzero(~lost).tolist(), np.flatnonzero(lost).tolist()
 
 
 def _frame(lab: Lab, motion: Motion, nominal: int, time_s: float, brightness: float) -> SyntheticFrame:

@@ -1,0 +1,89 @@
+"""The first pass over all tosses (P, O): one object frame, one shape; do all tosses show that shape there?
+
+A registration can fit what two tosses see in common and still be wrong by a symmetry (a prism's faces look alike); then
+their frames fused together explain neither.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from processing import stage_notices as say
+from processing.images import Images
+from processing.passes import Pass
+from processing.run import Run, each
+from processing.stages.field import learn_field
+from processing.stages.fuse import fuse_frames
+from processing.stages.judge import judge, residuals
+from processing.stages.place import place_shape
+from processing.stages.register import register
+from processing.store import Done
+from processing.variants import refuse_baseline
+
+
+def first_pass(run: Run, alone: Mapping[int, Done], images: Mapping[int, Images]) -> Pass:
+    """P, O: all tosses in one object frame, and one shape. Tosses that the shape of all does not explain are kept
+    apart, and the others joined anew: they were refined together with the wrong ones."""
+    refuse_baseline(run.tracker)
+    tosses, warnings = run.tosses, list(say.of_tracks(alone))
+    while True:
+        placed = register(run, {t: alone[t] for t in tosses}, images)
+        joined = [t for t in tosses if t not in placed.result.not_joined]
+        shape = learn_field(run, "all tosses", dict.fromkeys(joined, placed), images)
+        apart = kept_apart(run, placed, shape, images, joined)
+        if not apart:
+            warnings += say.of_register(placed)
+            return Pass(dict.fromkeys(tosses, placed), dict.fromkeys(tosses, shape),
+                        shared_frame=tosses == run.tosses, warnings=tuple(warnings))  # fmt: skip
+        warnings.append(say.kept_apart(apart))
+        tosses = tuple(t for t in tosses if t not in apart)
+
+
+def start_alone(run: Run, toss: int, first: Pass, alone: Done, images: Mapping[int, Images]) -> Pass:
+    """Where the cycle begins on one toss: p_i, and O in its object frame. A toss that is lost in P does not say how O
+    lies in it (it may be another object's): its own shape is taken."""
+    placed: Done = place_shape(run, toss, first.tracks[toss], alone, first.shapes[toss])
+    lost = not placed.result.frames
+    shape = learn_field(run, f"toss {toss}", {toss: alone}, images) if lost else placed
+    return Pass({toss: alone}, {toss: shape}, shared_frame=False, warnings=say.lost_among_all(toss) if lost else ())
+
+
+def kept_apart(
+    run: Run, together: Done, shape: Done, images: Mapping[int, Images], joined: Sequence[int]
+) -> tuple[int, ...]:
+    """Tosses that no one shape explains with the others. The outline decides: the share of a toss's mask and the drawn
+    shape that is not common to both, against `CycleConfig.apart_mask`; and half of that must be more than what the
+    toss's own frames fused alone leave (a pixel of a small mask is much, a gripper hides some).
+
+    Where the shape of all explains all, there are none. Else tosses are added one by one to the first, each kept only
+    where the frames fused so far explain every toss among them.
+    """
+    if not _unexplained(run, together, shape, images, joined):
+        return ()
+    kept: list[int] = list(joined[:1])
+    for toss in joined[1:]:
+        tried = [*kept, toss]
+        if not _unexplained(run, together, fuse_frames(run, together, images, tried), images, tried):
+            kept = tried
+    return tuple(t for t in joined if t not in kept)
+
+
+def _unexplained(
+    run: Run, together: Done, shape: Done, images: Mapping[int, Images], tosses: Sequence[int]
+) -> list[int]:
+    """Tosses whose outline the shape does not explain, although their own frames alone do."""
+    limit = run.config.cycle.apart_mask
+    left = _left(run, together, dict.fromkeys(tosses, shape), images)
+    unexplained = [t for t in tosses if left[t] > limit]
+    if not unexplained:
+        return []
+    alone = _left(run, together, each(run, unexplained, lambda t: fuse_frames(run, together, images, [t])), images)
+    return [t for t in unexplained if left[t] > alone[t] + 0.5 * limit]
+
+
+def _left(run: Run, together: Done, shapes: Mapping[int, Done], images: Mapping[int, Images]) -> dict[int, float]:
+    """Share of outline and drawn shape that is not common, median over a toss's frames; 0 where none can be judged."""
+    rows = residuals(judge(run, "one shape", dict.fromkeys(shapes, together), shapes, images)).rows
+    return {t: float(np.median(rows[rows[:, 0] == t, 3])) if (rows[:, 0] == t).any() else 0.0 for t in shapes}
