@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from numpy import ndarray as Array
 
+from processing.contact.friction.estimate import RESTITUTION_ASSUMED
 from processing.evaluate.metrics import distance_to_surface_m
 from processing.evaluate.report_curves import error_curves, rollout_curves
 from processing.evaluate.report_loops import SLOWED, toss_loops
@@ -108,10 +109,11 @@ def _physics(document: dict[str, Any]) -> str:
         + "</tr>"
         for r in rows
     )
+    assumed = f" Of restitution's, {RESTITUTION_ASSUMED}." if any(n == "restitution" for n, _ in titles) else ""
     return (
         f"<h2>What was learned of contact</h2><table><tr><th>variant</th>{head}</tr>{body}</table><p>Friction against "
         "the table and restitution; rollouts: the mean error of the learned model, simulated from the release on. In "
-        "brackets: 95 % intervals.</p>"
+        f"brackets: 95 % intervals.{assumed}</p>"
     )
 
 

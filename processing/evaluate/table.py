@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+from processing.contact.friction.estimate import RESTITUTION_ASSUMED
 from processing.evaluate.learned_values import learned_values
 from processing.evaluate.score import TossScore, Value, VariantScore
 from processing.variants import ROWS, TABLE, WITH_MODEL
@@ -135,6 +136,8 @@ def _legend(rows: Sequence[dict[str, Any]]) -> list[str]:
         lines.append("floor: each toss's frames fused at the true poses: what one toss can show of the shape at all.")
     if there & {name for name, _ in CONTACT_COLUMNS}:
         lines.append("Friction, restitution and rollouts with 95 % intervals; rollouts: mean error over 99 steps.")
+    if "restitution" in there:
+        lines.append(f"The interval of restitution: {RESTITUTION_ASSUMED}.")
     if any(row["paper"] for row in rows):
         lines.append("In brackets: the paper's figure for this row, on the paper's own data.")
     return lines

@@ -11,7 +11,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from processing.contact.friction.estimate import PROFILE, friction_by_forecasts, observed_trajectories
+from processing.contact.friction.estimate import (
+    PROFILE,
+    RESTITUTION_ASSUMED,
+    friction_by_forecasts,
+    observed_trajectories,
+)
 from processing.contact.friction.forecast import RigidBody
 from processing.contact.learn.shape_comparison import series_of
 from processing.contact.physics.inertia import uniform_physics
@@ -44,7 +49,7 @@ class LawSoFar:
         bounce = [float(np.clip(self.restitution + s * self.restitution_half, 0.0, 1.0)) for s in (-1, 1)]
         return (
             f"friction {self.friction:.2f} ({low:.2f} to {high:.2f}), restitution {self.restitution:.2f} "
-            f"({bounce[0]:.2f} to {bounce[1]:.2f})"
+            f"({bounce[0]:.2f} to {bounce[1]:.2f}; {RESTITUTION_ASSUMED})"
         )
 
 

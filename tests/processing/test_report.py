@@ -249,6 +249,7 @@ def test_friction_restitution_and_rollouts_stand_in_one_table_with_their_interva
     cells = re.findall(r"<td>(.*?)</td>", table)
     assert cells == ["ours (all)", "0.177 [0.060, 0.295]", "0.110", "16.4 [2.0, 30.8]"]
     assert re.findall(r"<th>(.*?)</th>", table) == ["variant", "friction", "restitution", "rollout mm, truth"]
+    assert "Of restitution's, +-0.20 of it is assumed, not measured." in page
     assert "What was learned of contact" not in page_of(made)
 
 

@@ -45,6 +45,8 @@ REPEATS = 300
 MODEL_RESTITUTION = 0.1
 """Standard deviation that stays with any number of tosses, because Newton's rule is not the world: assumed. What
 simulated bodies want is fitted on one half of them and reported on the other by tools/bench_intervals.py slow."""
+RESTITUTION_ASSUMED = f"+-{1.96 * MODEL_RESTITUTION:.2f} of it is assumed, not measured"
+"""Said wherever the interval of a restitution is."""
 MODEL_SHARE = 0.15
 """Standard deviation, relative, that stays with any number of tosses: rms of estimate / truth - 1 over 14 simulated
 bodies of other contact laws, shapes and noise is .154, and 13 of the intervals hold the truth: the same bodies, so

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from processing.contact.friction.estimate import RESTITUTION_ASSUMED
 from processing.contact.learn.data_checks import plane_warning
 from processing.contact.learn.learn import ContactLearning
 from processing.contact.report.rollout_errors import Evaluation
@@ -104,7 +105,7 @@ def left_out_notice(toss: int, why: str) -> Notice:
 
 def result_text(learning: ContactLearning, evaluation: Evaluation | None, warnings: Sequence[str] = ()) -> str:
     """A few lines for the terminal; `warnings` are those that the command adds."""
-    f = learning.friction
+    f, e = learning.friction, learning.restitution
     edges = " x ".join(f"{s.value * 1e3:.1f}" for s in learning.extents)
     half = ", ".join(f"{(s.high - s.low) / 2e-3:.1f}" for s in learning.extents)
     lines = [f"warning: {w}" for w in (*(n.text for n in in_order(warnings_of(learning))), *warnings)]
@@ -112,6 +113,11 @@ def result_text(learning: ContactLearning, evaluation: Evaluation | None, warnin
         f"learned from {len(learning.tosses)} tosses, {learning.transitions} transitions ({learning.geometry})",
         f"size      {edges} mm (95 %: +- {half})",
         f"friction  {f.value:.3f} (95 %: {f.low:.3f} .. {f.high:.3f}; {learning.spread.method})",
+        *(
+            []
+            if e is None
+            else [f"rebound   restitution {e.value:.2f} (95 %: {e.low:.2f} .. {e.high:.2f}; {RESTITUTION_ASSUMED})"]
+        ),
         f"plane     1 mm higher makes the size {learning.plane_sensitivity['mean_extent_m_per_m']:+.2f} mm",
         f"physics   {learning.model.physics_source}; weight of dissipation {learning.weights.dissipation:g}",
         f"fit       {learning.cpu_seconds:.1f} CPU-s, {learning.solver_failures} unsolved inner problems",
