@@ -81,3 +81,10 @@ def test_too_few_impacts_for_friction_are_said() -> None:
     sides = [sides_of(still(np.eye(3)), CENTER, WORLD_FROM_CAMERA, 2)]
     found = options(sides, None, CENTER, EXTENT_M, WORLD_FROM_CAMERA, None, {0: Throw(2.0, 0.2)})
     assert [o.text.split(":")[0] for o in found] == ["2 more that fly, hit the table and come to rest"]
+
+
+def test_the_law_so_far_says_what_of_restitutions_interval_is_assumed():
+    text = LawSoFar(0.3, 0.1, 0.1, 0.25, {}).text()
+    assert text == (
+        "friction 0.30 (0.20 to 0.40), restitution 0.10 (0.00 to 0.35; +-0.20 of it is assumed, not measured)"
+    )
