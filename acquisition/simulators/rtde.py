@@ -98,18 +98,19 @@ class UrServer(Faulty):
     # --- the controller's tick ---------------------------------------------------------------------------------
 
     def _run(self) -> None:
-        pacer = Pacer(TICK_S)
+        pacer, late_s = Pacer(TICK_S), 0.0
         while not self._closed.is_set():
             with self._lock:
                 self._apply_faults()
-                self.body.step(self._registers)
+                self.body.step(self._registers, late_s)
                 self._ticks += 1
                 state = self._state()
                 clients = tuple(self._clients)
             if not self._faults.active("freeze"):
                 for client in clients:
                     client.send(state, self._ticks)
-            self._stretched_s += pacer.wait()
+            late_s = pacer.wait()
+            self._stretched_s += late_s
 
     def _apply_faults(self) -> None:
         if self._faults.take("protective_stop"):

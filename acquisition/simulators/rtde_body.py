@@ -56,12 +56,13 @@ class UrBody:
         self.script_running, self.answer = False, 0
         self._servo = self._move = None
 
-    def step(self, registers: Mapping[str, float]) -> None:
+    def step(self, registers: Mapping[str, float], late_s: float = 0.0) -> None:
+        """One tick; `late_s`: by how much the machine made it longer, in which the client's targets went on."""
         if self.script_running:
             self._run_script(registers)
         before = self.q_target
         self.q_target = self._next_target()
-        self.dq_target = (self.q_target - before) / TICK_S
+        self.dq_target = (self.q_target - before) / (TICK_S + late_s)
         if (np.abs(self.dq_target) > DQ_MAX_RAD_S).any():
             self.q_target, self.dq_target = before, np.zeros(wire.JOINTS)
             self.stop(wire.SafetyMode.PROTECTIVE_STOP)
