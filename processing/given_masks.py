@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Literal, get_args
-
-from jaxtyping import Bool
-from numpy import ndarray as Array
+from typing import Any, Literal, TypeVar, get_args
 
 GivenMasks = Literal["first", "first-toss", "all", "none"]
 DEFAULT_MASKS: GivenMasks = "first"
+Mask = TypeVar("Mask")
+"""(h, w) bool; numpy is not imported for it, so that `--help` answers at once."""
 
 
 def add_masks_argument(parser: Any) -> None:
@@ -22,9 +21,7 @@ def add_masks_argument(parser: Any) -> None:
     )
 
 
-def chosen_masks(
-    given: Mapping[int, Bool[Array, "h w"]], choice: GivenMasks, first_toss: bool
-) -> dict[int, Bool[Array, "h w"]]:
+def chosen_masks(given: Mapping[int, Mask], choice: GivenMasks, first_toss: bool) -> dict[int, Mask]:
     """The given masks of one toss that are used, by position of the frame."""
     if choice == "none" or (choice == "first-toss" and not first_toss):
         return {}

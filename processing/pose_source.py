@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from recordings.errors import BadInput
-from recordings.tracks import ObjectTrack
 
 if TYPE_CHECKING:
     from processing.evaluate.truth import Truth
@@ -84,6 +83,7 @@ def _true_series(truth: Truth, session: Session, toss: int) -> PoseSeries | None
     from processing.motion.trajectory import PoseSeries
     from recordings.session import Toss
     from recordings.session_writer import toss_name
+    from recordings.tracks import ObjectTrack
 
     own = truth.folder / f"{toss_name(toss)}.mcap"
     if CAMERA not in session.calibration.cameras:

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from recordings.bounded.limits import MOST_PICKLE_STEPS
 from recordings.errors import BadInput
 
 if TYPE_CHECKING:
@@ -110,6 +109,8 @@ def _check_container(path: Path) -> None:
 
 def _check_pickles(file: Any, count: int) -> None:
     """Walk the opcodes, which builds nothing."""
+    from recordings.bounded.limits import MOST_PICKLE_STEPS
+
     steps = 0
     for _ in range(count):
         for opcode, argument, _ in pickletools.genops(file):
