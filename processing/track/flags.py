@@ -101,6 +101,7 @@ def contradicting(
     off = [_contradict(store, poses, int(i), first, config) for i in index]
     fits = (figures[:, 0] < config.joining_cost) & (figures[:, 1] > config.joining_share)
     near = np.union1d(pairs[fits & (pairs == first).any(1)], [first])
+    near = near[near < len(use)]  # not the views of a known shape
     out, start = np.zeros(len(use), dtype=bool), 0
     for lasting, run in groupby(off):
         end = start + len(list(run))

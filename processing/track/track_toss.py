@@ -369,7 +369,9 @@ def _as_track(
         twists = twists + uncertainty(joint.poses[:n], other.joint.poses[:n], apart, config.flags)
     twists = twists + unknown_motion(scene, joint.poses[:n], best.use)
     hanging = unjoined(joint.pairs, joint.figures, (first, *range(n, len(scene.store))), best.use & ~lost, config.flags)
-    slipped = contradicting(scene.store, joint.poses, first, best.use & ~lost, joint.pairs, joint.figures, config.flags)
+    slipped = contradicting(
+        scene.store, joint.poses[:n], first, best.use & ~lost, joint.pairs, joint.figures, config.flags
+    )
     twists = twists + unjoined_uncertainty(hanging | slipped, best.center_m, config.flags)
     poses, status, covariance = flagged(joint.poses[:n], twists, lost, scene, config.flags)
     times_ns = np.array([f.time_ns for f in frames], dtype=np.int64)
