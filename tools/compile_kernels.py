@@ -26,7 +26,7 @@ MOTION = (V, V, VB, V, V, V, F8, V)
 ROLL = (T, M, M, M, VI, M, M, M, F8, I8, I8, F8)
 KERNELS: dict[tuple[str, str], list[tuple[str, ...]]] = {
     (TRACK, "align_view"): [(M, I8, VI, T, M4, M4, MI, V, V, M, V, M)],
-    (TRACK, "graph_terms"): [(T, MI, M4, M4, MI, V, V, V, T, M, M)],
+    (TRACK, "graph_terms"): [(T, MI, M4, M4, MI, V, V, V, "boolean", T, M, T, T, M)],
     (TRACK, "view_terms"): [(M, I8, VI, T, M4, M4, MI, V, V, V, M, V)],
     (TRACK, "to_object"): [(M, V, M, F8, M, V)],
     (PROFILE, "surface_terms"): [(M4, M, M, V, V, VB, VI, V, F8, F8, M, V, M, M, V)],

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import groupby
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -11,6 +12,8 @@ from numpy import ndarray as Array
 
 from processing.motion.interpolate import between
 from processing.sensor import noise
+from processing.sensor import view_layout as lay
+from processing.sensor.view import ViewStore
 from processing.track.beam import Scene
 from recordings.geometry import rotation_log, skew
 from recordings.tracks import Status
@@ -36,6 +39,13 @@ class FlagConfig:
     """Nor do pairs that see less of each other's surface."""
     unjoined_sigma_rad: float = 0.5
     """How far views may be turned against the first one where no chain of pairs joins them to it."""
+    outside_px: float = 3.0
+    """What one view saw lies inside the outline of every other one, but for what a stereo matcher adds to the rim: half
+    the window of 7 pixels over which it sums (`noise.PUBLISHED`)."""
+    outside_share: float = 0.1
+    """Views of which more lies outside the other's outline contradict each other ..."""
+    contradicting: int = 3
+    """... as poses, where so many in a row do: a mask may be wrong for a frame or two."""
     unsure_deg: float = 15.0
     """A pose whose rotation may be off by more than this (standard deviation) is a guess, marked as interpolated: a
     flip (45 degrees) lies within three of them."""
@@ -78,6 +88,49 @@ def unjoined(
     a, b = pairs[fits].T
     _, label = connected_components(coo_array((np.ones(len(a)), (a, b)), shape=(count, count)), directed=False)
     return np.asarray(use & ~np.isin(label[: len(use)], label[list(roots)]))
+
+
+def contradicting(
+    store: ViewStore, poses: Float[Array, "n 4 4"], first: int, use: Bool[Array, " n"], pairs: Int[Array, "m 2"],
+    figures: Float[Array, "m 3"], config: FlagConfig,
+) -> Bool[Array, " n"]:  # fmt: skip
+    """Used frames whose outlines contradict the first one's, whichever side of the body they show, and those between
+    them and the nearest frame that a fitting pair joins to the first one: somewhere there a chain of pairs, each of
+    which fits, has slipped."""
+    index = np.flatnonzero(use)
+    off = [_contradict(store, poses, int(i), first, config) for i in index]
+    fits = (figures[:, 0] < config.joining_cost) & (figures[:, 1] > config.joining_share)
+    near = np.union1d(pairs[fits & (pairs == first).any(1)], [first])
+    near = near[near < len(use)]  # not the views of a known shape
+    out, start = np.zeros(len(use), dtype=bool), 0
+    for lasting, run in groupby(off):
+        end = start + len(list(run))
+        low, high = index[start], index[end - 1]
+        if lasting and end - start >= config.contradicting:
+            low, high = (near[near < low].max() + 1, high) if low > first else (low, near[near > high].min() - 1)
+            out[low : high + 1] = True
+        start = end
+    return out & use
+
+
+def _contradict(store: ViewStore, poses: Float[Array, "n 4 4"], one: int, other: int, config: FlagConfig) -> bool:
+    shares = [_outside_share(store, poses, i, j, config) for i, j in ((one, other), (other, one))]
+    return max(shares) > config.outside_share
+
+
+def _outside_share(store: ViewStore, poses: Float[Array, "n 4 4"], one: int, other: int, config: FlagConfig) -> float:
+    """Share of what one view saw that lies outside another's outline (what may be hidden there does not count)."""
+    first, count = (int(store.table[one, c]) for c in (lay.FIRST, lay.COUNT))
+    points = store.samples[first : first + count, :3].astype(np.float64)
+    relative = poses[other] @ np.linalg.inv(poses[one])
+    points = points @ relative[:3, :3].T + relative[:3, 3]
+    offset, u0, v0, w, h = (int(c) for c in store.table[other, : lay.HEIGHT + 1])
+    pixels = points[:, :2] / points[:, 2:] * store.rectified.focal + store.rectified.center - (u0, v0)
+    u, v = np.round(pixels).astype(int).T
+    seen = (u >= 0) & (v >= 0) & (u < w) & (v < h)
+    outside = np.full(count, np.inf)
+    outside[seen] = store.maps[offset + v[seen] * w + u[seen], lay.OUTSIDE]
+    return float(np.mean(outside[outside >= 0] > config.outside_px)) if (outside >= 0).any() else 0.0
 
 
 def unjoined_uncertainty(

@@ -17,11 +17,13 @@ from numpy import ndarray as Array
 
 from processing.motion import se3_kernels as se3
 from processing.motion.interpolate import turn_between
+from processing.motion.motion_prior import free_change_rad_s, free_jerk_rad_s
 from processing.sensor import noise
 from processing.sensor.view import ViewStore
 from processing.track import kernels as k
 from processing.track.beam import Schedule, rows
 from processing.track.keyframes import view_directions
+from processing.track.shading import eliminated
 from recordings.geometry import rotation_log, skew
 from recordings.robust import geman_mcclure_weight
 
@@ -52,7 +54,7 @@ class GraphConfig:
     sure_cost: float = 0.08
     """A pair that fits worse counts less."""
     spin_change_rad_s: float = 0.5
-    """Standard deviation of the change of spin between frames in flight (not an impact)."""
+    """Standard deviation of the change of spin between frames (not an impact), beyond what a free body's changes by."""
     velocity_change_m_s: float = 0.06
     """... and of the velocity beyond gravity's share."""
     jerk_rad_s: float | None = 0.25
@@ -215,10 +217,14 @@ def _normal_equations(
     count = int(place.max()) + 1
     blocks, gradients = np.zeros((len(pairs), 6, 6)), np.zeros((len(pairs), 6))
     figures = np.zeros((len(pairs), 3))
+    shaded = not config.round_body
+    crossed, among = k.shading_terms(len(pairs) if shaded else 0)
     k.graph_terms(
         poses, pairs, store.maps, store.samples, store.table, store.rectified.focal, store.rectified.center, row,
-        blocks, gradients, figures,
+        shaded, blocks, gradients, crossed, among, figures,
     )  # fmt: skip
+    if shaded:
+        blocks, gradients = eliminated(blocks, gradients, crossed, among)
     weight = 1.0 / (1.0 + (figures[:, 0] / config.sure_cost) ** 2) / config.shared_noise
     blocks *= weight[:, None, None]
     gradients *= weight[:, None]
@@ -258,8 +264,11 @@ def _add_motion(
         if motion.toss[a] != motion.toss[c] or motion.still[b] or motion.still[c]:
             continue
         residual, jacobians = motion_residual((poses[a], poses[b], poses[c]), motion.times_s[[a, b, c]], motion)
-        spin, speed = residual[:3] / config.spin_change_rad_s, residual[3:] / config.velocity_change_m_s
-        w_spin = _accepted(spin) / config.spin_change_rad_s**2
+        turn = turn_between(poses[c], poses[a]) / (motion.times_s[c] - motion.times_s[a])
+        free = free_change_rad_s(float(np.linalg.norm(turn)), 0.5 * (motion.times_s[c] - motion.times_s[a]))
+        sigma_rad_s = float(np.hypot(config.spin_change_rad_s, free))
+        spin, speed = residual[:3] / sigma_rad_s, residual[3:] / config.velocity_change_m_s
+        w_spin = _accepted(spin) / sigma_rad_s**2
         w_speed = _accepted(speed) / config.velocity_change_m_s**2
         w = np.array([w_spin] * 3 + [w_speed] * 3)
         for x, jx in zip((a, b, c), jacobians):
@@ -282,7 +291,9 @@ def _add_smooth(
         steps = np.diff(motion.times_s[list(four)])
         spins = [turn_between(poses[b], poses[a]) / s for a, b, s in zip(four, four[1:], steps)]
         residual = spins[2] - 2 * spins[1] + spins[0]
-        w = _accepted(residual / sigma_rad_s) / sigma_rad_s**2
+        fast = float(np.median(np.linalg.norm(spins, axis=1)))
+        sigma = float(np.hypot(sigma_rad_s, free_jerk_rad_s(fast, float(steps.mean()))))
+        w = _accepted(residual / sigma) / sigma**2
         shares = (-1 / steps[0], 1 / steps[0] + 2 / steps[1], -2 / steps[1] - 1 / steps[2], 1 / steps[2])
         jacobians = [-share * poses[i][:3, :3] for i, share in zip(four, shares)]
         for x, jx in zip(four, jacobians):

@@ -43,6 +43,10 @@ LEVEL, STEPS, GEOMETRY_M, INTENSITY, OUTLINE_M, SHARE, ROUND = range(7)
 LEAST_SLOPE, LEAST_BRIGHT_SLOPE = 0.03, 0.1
 """An appearance that changes by less a pixel is shading, which stays with the room: it pulls little; brightness above
 all."""
+SHADING = 3 * APPEARANCE
+"""Unknowns of a pair's shading (processing/track/shading.py): what each channel gains along the normal's x, y, z."""
+NO_SHADING = np.empty((0, 0)), np.empty((0, 0))
+"""B and N of pair_terms where it is not sought."""
 GRAZING, FACING = 0.3, 0.8
 COVERED_COST = 0.12
 """Of a point that faces the other view but lies behind what is seen there: it may be covered."""
@@ -52,11 +56,15 @@ ODD_COST = 0.4
 
 @no_type_check
 @njit(cache=True, nogil=True, fastmath=True)
-def pair_terms(samples, step, pose, maps, row, focal, center, level, s_geo, s_int, s_out, round_body, H, g):  # noqa: C901
+def pair_terms(  # noqa: C901
+    samples, step, pose, maps, row, focal, center, level, s_geo, s_int, s_out, round_body, shaded, H, g, B, N
+):
     """Adds normal equations of `samples` (of one camera) seen by another view, in that view's camera frame.
 
     pose: 4x4 other_from_sample_camera. H (6, 6), g (6): J^T W J and J^T W r for a twist (translation, rotation) of the
-    points in the other camera's frame. Returns cost sum, points counted, points on the surface, violations.
+    points in the other camera's frame. Where `shaded`, B (6, SHADING) and N (SHADING + 1, SHADING) get J^T W K, and
+    K^T W K above r^T W K, for derivatives K by the pair's shading. Returns cost sum, points counted, points on the
+    surface, violations.
     """
     # long because: one compiled loop over points, the tracker's innermost
     off, u0, v0, w, h = row[OFFSET], row[U0], row[V0], row[WIDTH], row[HEIGHT]
@@ -65,7 +73,7 @@ def pair_terms(samples, step, pose, maps, row, focal, center, level, s_geo, s_in
     seen = 0
     on = 0
     against = 0
-    J = np.empty(6)
+    J, K = np.empty(6), np.zeros(3)
     wg, wi, wo = 1.0 / (s_geo * s_geo), 1.0 / (s_int * s_int), 1.0 / (s_out * s_out)
     for i in range(0, samples.shape[0], step):
         p = samples[i]
@@ -179,6 +187,9 @@ def pair_terms(samples, step, pose, maps, row, focal, center, level, s_geo, s_in
                     J[0], J[1] = gu, gv
                     J[2] = -(gu * x + gv * y) * iz
                     _add(J, x, y, z, e, wi * k * k, H, g)
+                    if shaded:
+                        K[0], K[1], K[2] = p[SNX] - mx, p[SNY] - my, p[SNZ] - mz
+                        _add_shading(J, e, wi * k * k, K, 3 * c, B, N)
     return cost, seen, on, against
 
 
@@ -197,12 +208,39 @@ def _add(J, x, y, z, r, weight, H, g):
 
 
 @no_type_check
+@njit(cache=True, nogil=True, fastmath=True, inline="always")
+def _add_shading(J, r, weight, K, first, B, N):
+    """One residual whose derivative by the shading from `first` on is K."""
+    for a in range(3):
+        ka = weight * K[a]
+        N[SHADING, first + a] += ka * r
+        for b in range(3):
+            N[first + a, first + b] += ka * K[b]
+        for b in range(6):
+            B[b, first + a] += ka * J[b]
+
+
+@no_type_check
 @njit(cache=True, nogil=True)
 def to_object(H, g, pose, sign, H_out, g_out):
     """Adds normal equations of a camera frame to those of the object frame: twist_camera = sign * A twist_object.
 
     pose: 4x4 camera_from_object. H has its lower triangle only.
     """
+    A = _twist_in_camera(pose)
+    full = np.empty((6, 6))
+    for a in range(6):
+        for b in range(a + 1):
+            full[a, b] = H[a, b]
+            full[b, a] = H[a, b]
+    H_out += A.T @ full @ A
+    g_out += sign * (A.T @ g)
+
+
+@no_type_check
+@njit(cache=True, nogil=True)
+def _twist_in_camera(pose):
+    """The matrix (6, 6) that turns twists of the object frame into those of the camera frame."""
     A = np.zeros((6, 6))
     for i in range(3):
         for j in range(3):
@@ -213,13 +251,7 @@ def to_object(H, g, pose, sign, H_out, g_out):
         A[0, j + 3] = t[1] * pose[2, j] - t[2] * pose[1, j]
         A[1, j + 3] = t[2] * pose[0, j] - t[0] * pose[2, j]
         A[2, j + 3] = t[0] * pose[1, j] - t[1] * pose[0, j]
-    full = np.empty((6, 6))
-    for a in range(6):
-        for b in range(a + 1):
-            full[a, b] = H[a, b]
-            full[b, a] = H[a, b]
-    H_out += A.T @ full @ A
-    g_out += sign * (A.T @ g)
+    return A
 
 
 @no_type_check
@@ -233,13 +265,14 @@ def view_terms(pose, view, refs, ref_poses, maps, samples, table, focal, center,
     back = inverse(pose)
     cost, seen, on, against = 0.0, 0, 0, 0
     h6, g6 = np.empty((6, 6)), np.empty(6)
+    none = np.empty((0, 0))
     for k in range(refs.shape[0]):
         ref_pose = ref_poses[k]
         other = table[refs[k]]
         h6[:], g6[:] = 0.0, 0.0
         c, s, o, v = pair_terms(
             mine, step, ref_pose @ back, maps, other, focal, center, level, row[GEOMETRY_M], row[INTENSITY],
-            row[OUTLINE_M], row[ROUND] > 0.5, h6, g6,
+            row[OUTLINE_M], row[ROUND] > 0.5, False, h6, g6, none, none,
         )  # fmt: skip
         to_object(h6, g6, ref_pose, 1.0, H, g)
         cost, seen, on, against = cost + c, seen + s, on + o, against + v
@@ -247,7 +280,7 @@ def view_terms(pose, view, refs, ref_poses, maps, samples, table, focal, center,
         h6[:], g6[:] = 0.0, 0.0
         c, s, o, v = pair_terms(
             theirs, 2 * step, pose @ inverse(ref_pose), maps, table[view], focal, center, level, row[GEOMETRY_M],
-            row[INTENSITY], row[OUTLINE_M], row[ROUND] > 0.5, h6, g6,
+            row[INTENSITY], row[OUTLINE_M], row[ROUND] > 0.5, False, h6, g6, none, none,
         )  # fmt: skip
         to_object(h6, g6, pose, -1.0, H, g)
         cost, seen, on, against = cost + c, seen + s, on + o, against + v
@@ -307,24 +340,37 @@ def _pull(pose, wanted, information, H, g):
 
 
 @no_type_check
+def shading_terms(pairs):
+    """Places for what graph_terms says of the shading of so many pairs."""
+    return np.zeros((pairs, 6, SHADING)), np.zeros((pairs, SHADING + 1, SHADING))
+
+
+@no_type_check
 @njit(cache=True, nogil=True)
-def graph_terms(poses, pairs, maps, samples, table, focal, center, row, blocks, gradients, figures):
+def graph_terms(
+    poses, pairs, maps, samples, table, focal, center, row, shaded, blocks, gradients, crossed, among, figures
+):
     """Normal equations of each pair (i, k): points of view i in view k.
 
     blocks (m, 6, 6), gradients (m, 6) for the twist of i; that of k has the opposite sign. figures (m, 3): mean cost,
-    share on the surface, share of violations."""
+    share on the surface, share of violations. Where `shaded`, crossed (m, 6, SHADING) and among (m, SHADING + 1,
+    SHADING) are the pair's B (for the twist of i) and N."""
     level = int(row[LEVEL])
     step = max(1, int(np.round(1.0 / row[SHARE])))
     h6, g6 = np.empty((6, 6)), np.empty(6)
+    b6, n6 = np.zeros((6, SHADING)), np.zeros((SHADING + 1, SHADING))
     for m in range(pairs.shape[0]):
         i, k = pairs[m, 0], pairs[m, 1]
-        h6[:], g6[:] = 0.0, 0.0
+        h6[:], g6[:], b6[:], n6[:] = 0.0, 0.0, 0.0, 0.0
         mine = samples[table[i, FIRST] : table[i, FIRST] + table[i, COUNT]]
         c, s, o, v = pair_terms(
             mine, step, poses[k] @ inverse(poses[i]), maps, table[k], focal, center, level, row[GEOMETRY_M],
-            row[INTENSITY], row[OUTLINE_M], row[ROUND] > 0.5, h6, g6,
+            row[INTENSITY], row[OUTLINE_M], row[ROUND] > 0.5, shaded, h6, g6, b6, n6,
         )  # fmt: skip
         blocks[m], gradients[m] = 0.0, 0.0
         to_object(h6, g6, poses[k], 1.0, blocks[m], gradients[m])
+        if shaded:
+            crossed[m] = _twist_in_camera(poses[k]).T @ b6
+            among[m] = n6
         n = max(1, s)
         figures[m, 0], figures[m, 1], figures[m, 2] = c / n, o / n, v / n

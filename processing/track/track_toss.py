@@ -20,7 +20,15 @@ from processing.sensor.rectification import Rectification
 from processing.sensor.view import Crop, ViewConfig, ViewStore, cut
 from processing.track.beam import BeamConfig, Candidate, Hypothesis, Scene, follow, started
 from processing.track.depth_color_offset import unknown_motion
-from processing.track.flags import FlagConfig, flagged, per_view, uncertainty, unjoined, unjoined_uncertainty
+from processing.track.flags import (
+    FlagConfig,
+    contradicting,
+    flagged,
+    per_view,
+    uncertainty,
+    unjoined,
+    unjoined_uncertainty,
+)
 from processing.track.hypotheses import HypothesisConfig, TrajectoryHypothesis, apart_deg, select
 from processing.track.keyframes import is_new
 from processing.track.known_shape import ShapeConfig, ShapeViews, center_of, located, shape_views
@@ -361,7 +369,10 @@ def _as_track(
         twists = twists + uncertainty(joint.poses[:n], other.joint.poses[:n], apart, config.flags)
     twists = twists + unknown_motion(scene, joint.poses[:n], best.use)
     hanging = unjoined(joint.pairs, joint.figures, (first, *range(n, len(scene.store))), best.use & ~lost, config.flags)
-    twists = twists + unjoined_uncertainty(hanging, best.center_m, config.flags)
+    slipped = contradicting(
+        scene.store, joint.poses[:n], first, best.use & ~lost, joint.pairs, joint.figures, config.flags
+    )
+    twists = twists + unjoined_uncertainty(hanging | slipped, best.center_m, config.flags)
     poses, status, covariance = flagged(joint.poses[:n], twists, lost, scene, config.flags)
     times_ns = np.array([f.time_ns for f in frames], dtype=np.int64)
     track = ObjectTrack(toss, camera, object_frame, times_ns, poses, status, covariance)

@@ -55,7 +55,7 @@ def moved(twist):
 def pair(maps, sample, pose=None, level=0, round_body=False):
     H, g = np.zeros((6, 6)), np.zeros(6)
     cost, _, _, _ = k.pair_terms(sample, 1, np.eye(4) if pose is None else pose, maps, ROW, FOCAL, CENTER, level, S_GEO,
-                                 S_INT, S_OUT, round_body, H, g)  # fmt: skip
+                                 S_INT, S_OUT, round_body, False, H, g, *k.NO_SHADING)  # fmt: skip
     return cost, H, g
 
 
@@ -100,6 +100,25 @@ def test_a_views_appearance_pulls_along_its_gradient_less_where_it_is_shading(ch
     # hardly. And the APPEARANCE channels share one half of a point's cost, but pull each as a whole.
     trusted = (1 - r * r / 9) * square / (square + least**2)
     np.testing.assert_allclose(g, lay.APPEARANCE * 9 * trusted**2 * wanted, rtol=2e-3, atol=2e-3 * np.abs(g).max())
+
+
+def test_an_appearances_derivative_by_its_shading_is_the_change_of_the_normal():
+    maps, normal = plane_maps()
+    maps[:, lay.SHARP : lay.SHARP + lay.APPEARANCE] = 0.0
+    maps[:, lay.SHARP + 1] = 0.07 * np.tile(np.arange(WIDTH), HEIGHT)
+    turn = moved([0, 0, 0, 0.2, -0.1, 0.3])
+    own = sample_at(maps, 44, 25, 0.0, normal)
+    sample = own.copy()
+    sample[0, :3], sample[0, 3:6] = turn[:3, :3].T @ own[0, :3], turn[:3, :3].T @ normal
+    sample[0, lay.SSHARP : lay.SSHARP + lay.APPEARANCE] = [0.0, 0.07 * 44.0, 0.0]
+    H, g, B, N = np.zeros((6, 6)), np.zeros(6), np.zeros((6, k.SHADING)), np.zeros((k.SHADING + 1, k.SHADING))
+    k.pair_terms(sample, 1, turn, maps, ROW, FOCAL, CENTER, 0, S_GEO, S_INT, S_OUT, False, True, H, g, B, N)
+    change = sample[0, 3:6] - normal
+    np.testing.assert_allclose(N[-1, 3:6] * change[0], N[-1, 3] * change, rtol=1e-5)  # r^T W K is along K ...
+    np.testing.assert_allclose(N[3:6, 3:6] / np.trace(N), np.outer(change, change) / (change @ change), rtol=1e-5)
+    appearance = g * N[3, 3] / N[-1, 3]  # ... and J^T W K along J, but for the share of depth, some micrometres off
+    np.testing.assert_allclose(B[:, 3], appearance, rtol=1e-3, atol=2e-3 * np.abs(appearance).max())
+    assert np.abs(np.delete(N, [3, 4, 5, 9], 0)).max() == np.abs(N[:, [0, 1, 2, 6, 7, 8]]).max() == 0
 
 
 def outside_maps(slope_u, slope_v):

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 
-from processing.track.flags import FlagConfig, unjoined, unjoined_uncertainty
+from processing.sensor import view_layout as lay
+from processing.sensor.view import ViewStore
+from processing.track.flags import FlagConfig, contradicting, unjoined, unjoined_uncertainty
 from recordings.geometry import rotation_exp
 
 GOOD, BAD = (0.03, 0.95, 0.01), (0.2, 0.9, 0.05)
@@ -51,3 +56,53 @@ def test_the_uncertainty_of_a_hanging_frame_is_a_rotation_about_the_center_of_ma
     to_origin = uncertainty[1, :3, 3:] / 0.25
     np.testing.assert_allclose(to_origin @ turn, moved, atol=1e-10)
     assert np.linalg.eigvalsh(uncertainty[1])[0] == pytest.approx(0, abs=1e-12)
+
+
+CARD = np.array([[x, y, 0.8] for x in np.linspace(-0.05, 0.05, 21) for y in np.linspace(-0.01, 0.01, 5)])
+
+
+def views_of_a_card(quarter_turns: list[int]) -> ViewStore:
+    """Views of a long card at 0.8 m that has turned by so many quarters about the optical axis, 61 pixels wide."""
+    side = 61
+    maps: list[np.ndarray] = []
+    samples: list[np.ndarray] = []
+    table = []
+    for n, quarters in enumerate(quarter_turns):
+        points = CARD @ rotation_exp(np.array([0, 0, quarters * np.pi / 2])).T
+        half = np.abs(points).max(0)[:2] / 0.8 * 400.0
+        v, u = np.indices((side, side)) - side // 2
+        pixels = np.zeros((side * side, lay.CHANNELS), dtype=np.float32)
+        pixels[:, lay.OUTSIDE] = np.maximum(np.maximum(np.abs(u) - half[0], np.abs(v) - half[1]), 0).ravel()
+        rows = np.zeros((len(points), lay.SAMPLE), dtype=np.float32)
+        rows[:, :3] = points
+        maps, samples = [*maps, pixels], [*samples, rows]
+        table.append([n * side * side, -(side // 2), -(side // 2), side, side, n * len(CARD), len(CARD)])
+    store: Any = ViewStore.__new__(ViewStore)
+    store.maps, store.samples = np.concatenate(maps), np.concatenate(samples)
+    store.table, store.rectified = np.array(table), SimpleNamespace(focal=np.array([400.0, 400.0]), center=np.zeros(2))
+    return store
+
+
+def in_doubt(shown: list[int], believed: list[int], near: list[int]) -> list[int]:
+    poses = np.tile(np.eye(4), (len(shown), 1, 1))
+    for pose, quarters in zip(poses, believed):
+        pose[:3, :3] = rotation_exp(np.array([0, 0, quarters * np.pi / 2]))
+    pairs = np.array([(0, i) for i in near], dtype=np.int64)
+    use = np.ones(len(shown), dtype=bool)
+    figures = np.array([GOOD] * len(near))
+    found = contradicting(views_of_a_card(shown), poses, 0, use, pairs, figures, FlagConfig())
+    return np.flatnonzero(found).tolist()
+
+
+def test_outlines_that_contradict_the_first_one_for_long_put_the_way_there_in_doubt_too() -> None:
+    shown = [0, 0, 0, 0, 1, 1, 1, 1]
+    assert in_doubt(shown, [0] * 8, near=[1]) == [2, 3, 4, 5, 6, 7]
+    assert in_doubt(shown, [0] * 8, near=[1, 2, 3]) == [4, 5, 6, 7]
+
+
+def test_outlines_of_a_body_that_turned_as_its_poses_say_contradict_nothing() -> None:
+    assert in_doubt([0, 0, 0, 0, 1, 1, 1, 1], [0, 0, 0, 0, 1, 1, 1, 1], near=[1]) == []
+
+
+def test_a_wrong_mask_of_a_frame_or_two_contradicts_no_pose() -> None:
+    assert in_doubt([0, 0, 0, 1, 1, 0, 0, 0], [0] * 8, near=[1]) == []

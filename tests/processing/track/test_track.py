@@ -15,7 +15,13 @@ from processing.evaluate.metrics import align_first, frame_errors
 from processing.features.sift import rigid_fit
 from processing.motion import se3_kernels as se3
 from processing.motion.interpolate import moved, turn_between
-from processing.motion.motion_prior import MotionConfig, change_cost, steady_spin
+from processing.motion.motion_prior import (
+    MotionConfig,
+    change_cost,
+    free_change_rad_s,
+    free_jerk_rad_s,
+    steady_spin,
+)
 from processing.motion.rotation_grid import all_turns
 from processing.sensor import view_layout as lay
 from processing.sensor.rectification import Rectification
@@ -105,6 +111,23 @@ def test_free_flight_is_predicted_and_costs_nothing() -> None:
     np.testing.assert_allclose(predicted, poses[4], atol=1e-9)
     np.testing.assert_allclose(steady_spin(poses[:5], times[:5]), spin, atol=1e-9)
     assert change_cost((poses[2], poses[3], poses[4]), (1 / 30, 1 / 30), center, gravity, MotionConfig()) < 1e-6
+
+
+@pytest.mark.parametrize("askew_deg", [10, 45, 80])
+@pytest.mark.parametrize("along", [0.01, 0.6, 1.4, 2.0])
+def test_a_free_bodys_spin_changes_within_twice_its_standard_deviation(askew_deg: float, along: float) -> None:
+    inertia = np.array([1.0, 1.0, along])  # of a rod (0) to a disc (2) about its axis, one across
+    spin = 12.0 * np.array([np.sin(np.radians(askew_deg)), 0, np.cos(np.radians(askew_deg))])
+    change = -np.cross(spin, inertia * spin) / inertia  # Euler's equations without a torque, in the body's axes
+    step_s = 1 / 30
+    assert np.linalg.norm(change) * step_s <= 2 * free_change_rad_s(12.0, step_s) + 1e-12
+    if askew_deg == 45 and along in (0.01, 2.0):  # the bound is reached
+        assert np.linalg.norm(change) * step_s > 1.9 * free_change_rad_s(12.0, step_s)
+
+
+def test_of_a_body_that_hardly_spins_the_spin_hardly_changes() -> None:
+    assert free_change_rad_s(1.0, 1 / 30) < 0.01
+    assert free_jerk_rad_s(1.0, 1 / 30) < 0.001
 
 
 def test_an_impact_costs_no_more_than_the_cost_of_an_impact() -> None:
