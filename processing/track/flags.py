@@ -107,7 +107,10 @@ def contradicting(
         end = start + len(list(run))
         low, high = index[start], index[end - 1]
         if lasting and end - start >= config.contradicting:
-            low, high = (near[near < low].max() + 1, high) if low > first else (low, near[near > high].min() - 1)
+            if low > first:
+                low = near[near < low].max() + 1
+            elif high < first:
+                high = near[near > high].min() - 1
             out[low : high + 1] = True
         start = end
     return out & use

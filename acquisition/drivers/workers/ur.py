@@ -29,6 +29,7 @@ VARIABLES = [
 SILENT_S = 1.0
 """Without a new state for this long the arm counts as gone."""
 SCRIPT_S = 1.5
+STATE_S = 0.2
 CATCH_UP = 1.2
 """So many samples of the path a cycle may go on by, when it was late before."""
 SERVO_STOP_RAD_S2 = 10.0
@@ -219,11 +220,18 @@ class Follower:
         else:
             self._place += min(tick - self._place, CATCH_UP)
         if not self._servo(along(self._path, self._place)):
-            return self._over("aborted", self._stop_reason() or "the controller takes no more positions")
+            return self._over("aborted", self._why_stopped() or "the controller takes no more positions")
         if self._brake is not None and self._brake.standing:
             return self._over("aborted", "halted")
         arrived = self._place > len(self._path) + 3 * self._options["lookahead_s"] * self._rate_hz
         return self._over("done", "") if arrived else False
+
+    def _why_stopped(self) -> str:
+        """What the controller's states say of it, which may come a moment later than its refusal."""
+        until = time.monotonic() + STATE_S
+        while not (reason := self._stop_reason()) and time.monotonic() < until:
+            time.sleep(1 / self._rate_hz)
+        return str(reason)
 
     def _servo(self, q: Float[Array, "6"]) -> bool:
         options = self._options
