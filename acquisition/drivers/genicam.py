@@ -30,7 +30,7 @@ from recordings.errors import DeviceNotFound
 
 POP_US = 100_000
 LEAVE_S = 0.8
-HEARTBEAT_S = 5.0
+HEARTBEAT_S = 12.0
 """After so long without a word a GigE camera lets another program control it (the standard's own value is 3 s)."""
 LOOK_S = 0.2
 FRAME_ID_BITS = 16
