@@ -33,6 +33,8 @@ LEAVE_S = 0.8
 HEARTBEAT_S = 12.0
 """After so long without a word a GigE camera lets another program control it (the standard's own value is 3 s)."""
 LOOK_S = 0.2
+_LEAVING: dict[str, threading.Thread] = {}
+"""By Aravis' id, what still talks to a camera that this process has left: whoever opens it again waits for that."""
 FRAME_ID_BITS = 16
 """GigE Vision 1 counts frames from 1 to 65535 and starts over at 1."""
 
@@ -59,7 +61,6 @@ class GenicamCamera(OpenedByContext):
         self._warnings: list[str] = []
         self._inbox: Inbox[Image] = Inbox(self._settings.buffers)
         self._lock = threading.RLock()
-        self._leaving: threading.Thread | None = None
         self._counts: tuple[dict[str, int], dict[str, int]] = ({}, {})
 
     def open(self) -> None:
@@ -84,6 +85,8 @@ class GenicamCamera(OpenedByContext):
 
     def _take_control(self, aravis: Aravis, found: Found) -> int:
         """Aravis' camera, obeying us. One whose last program has died obeys nobody until its heartbeat runs out."""
+        if (left := _LEAVING.get(found.id)) is not None:
+            left.join(HEARTBEAT_S)
         until = time.monotonic() + HEARTBEAT_S
         while True:
             try:
@@ -159,16 +162,17 @@ class GenicamCamera(OpenedByContext):
 
     def _leave(self, act: Callable[[], Any]) -> None:
         """Do what talks to the camera once more, but do not wait: a camera that is gone takes Aravis 5 s to give up."""
-        before = self._leaving
+        assert self._found is not None
+        before = _LEAVING.get(self._found.id)
 
         def run() -> None:
             if before is not None:
                 before.join()
             act()
 
-        self._leaving = threading.Thread(target=run, daemon=True)
-        self._leaving.start()
-        self._leaving.join(LEAVE_S)
+        leaving = _LEAVING[self._found.id] = threading.Thread(target=run, daemon=True)
+        leaving.start()
+        leaving.join(LEAVE_S)
 
     def _opened(self) -> int:
         if self._camera is None:
