@@ -38,7 +38,7 @@ demo: $(BASE)
 	@echo "look at $(OUT)/result.png and $(OUT)/results/report.html, open $(OUT)/result.rrd: $(BIN)/toss-view $(OUT)/results"
 
 # One process a core, a file's tests in one of them (tests/conftest.py); more threads would only wait for each other.
-PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n logical --maxprocesses 8 --dist loadgroup
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n logical --maxprocesses 8
 
 test: $(STAMP)
 	$(PYTEST) -m "not slow and not gpu and not rig"

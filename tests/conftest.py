@@ -36,19 +36,28 @@ REAL_TIME = (
 TOGETHER = "real time"
 
 
-@pytest.hookimpl(tryfirst=True)
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """For pytest-xdist's `loadgroup`: a file's tests stay together, for its fixtures; those in real time all do."""
-    for item in items:
-        file = item.path.relative_to(ROOT / "tests").as_posix()
-        item.add_marker(pytest.mark.xdist_group(TOGETHER if file.startswith(REAL_TIME) else file))
+def _process(nodeid: str) -> str:
+    """The name of what runs in one process: a file's tests, for its fixtures; all that are in real time."""
+    file = nodeid.partition("::")[0].removeprefix("tests/")
+    return TOGETHER if file.startswith(REAL_TIME) else file
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: object) -> object:
+    """pytest-xdist's own `loadgroup` groups nothing with pytest 9.2, and says nothing."""
+    from xdist.scheduler import LoadScopeScheduling
+
+    class ByProcess(LoadScopeScheduling):
+        def _split_scope(self, nodeid: str) -> str:
+            return _process(nodeid)
+
+    return ByProcess(config, log)
 
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
     """A test in real time, and what it starts, goes before other processes where this user may (root)."""
-    marker = item.get_closest_marker("xdist_group")
-    if marker is None or marker.args != (TOGETHER,):
+    if _process(item.nodeid) != TOGETHER:
         return (yield)
     with contextlib.suppress(PermissionError):
         os.setpriority(os.PRIO_PROCESS, 0, -10)
