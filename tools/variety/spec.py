@@ -117,7 +117,7 @@ def draw(case: Case, tosses: int | None = None) -> Spec:
     """The session of a case; `tosses` bounds their number (the rest of the session stays the same)."""
     rng = np.random.default_rng(case.seed)
     family = FAMILIES[case.number % len(FAMILIES)]
-    surface = KINDS[(case.number // len(FAMILIES) + case.number) % len(KINDS)]
+    surface = KINDS[case.number % len(KINDS)]  # their numbers share no divisor: every family has every surface in turn
     kinds = tuple("good" if rng.random() < 0.85 else str(rng.choice(BAD)) for _ in range(int(rng.choice(TOSSES))))
     spec = Spec(
         case.name, case.seed, family, surface, str(rng.choice(["solid", "hollow", "off-centre"])),

@@ -1,9 +1,11 @@
 """The splits never meet and never change; moves are recorded."""
 
 import json
+from itertools import product
 
 import pytest
 from variety import seeds
+from variety.appearance import KINDS
 from variety.shapes import FAMILIES
 from variety.spec import draw
 
@@ -72,7 +74,7 @@ def test_the_same_case_is_the_same_session_and_fewer_tosses_change_nothing_else(
 
 def test_the_ranges_of_the_issue_are_kept_and_filled():
     specs = [draw(c) for c in seeds.cases("choose", 300, ())]
-    assert {s.family for s in specs} == set(FAMILIES)
+    assert {(s.family, s.surface) for s in specs} == set(product(FAMILIES, KINDS))
     for values, low, high in (
         ([s.friction for s in specs], 0.05, 0.8),
         ([s.restitution for s in specs], 0.0, 0.7),
