@@ -68,7 +68,7 @@ def test_the_folder_layout_comes_back_as_it_was(layout, tmp_path):
     check_round_trip(layout.path, tmp_path / "back")
 
 
-@pytest.mark.parametrize("name", ["cube_dev", "lab_dev"])
+@pytest.mark.parametrize("name", [pytest.param("cube_dev", marks=pytest.mark.slow), "lab_dev"])
 def test_the_shared_recordings_come_back_as_they_were(data: Callable[[str], Path], tmp_path, name):
     import_folder(data(name), tmp_path / "session")
     export_folder(tmp_path / "session", tmp_path / "back")
