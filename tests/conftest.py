@@ -59,12 +59,13 @@ def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object
     """A test in real time, and what it starts, goes before other processes where this user may (root)."""
     if _process(item.nodeid) != TOGETHER:
         return (yield)
+    usual = os.getpriority(os.PRIO_PROCESS, 0)
     with contextlib.suppress(PermissionError):
         os.setpriority(os.PRIO_PROCESS, 0, -10)
     try:
         return (yield)
     finally:
-        os.setpriority(os.PRIO_PROCESS, 0, 0)
+        os.setpriority(os.PRIO_PROCESS, 0, usual)
 
 
 @pytest.hookimpl(wrapper=True)
