@@ -26,7 +26,7 @@ from recordings.records import ArmStates, DepthImage, EncodedImage
 from recordings.session_writer import SessionWriter
 
 Kind = Literal["board", "hand-eye"]
-LEAST_GAP_NS = 1_000_000_000
+VIEW_INTERVAL_NS = 1_000_000_000
 ENOUGH = {"board": 30, "hand-eye": 20}
 PER_CAMERA = 12
 CELLS = 3
@@ -227,7 +227,7 @@ def _write(
     q: Float[Array, " j"] | None,
 ) -> None:
     """All cameras at one stamp: nothing moves, so that their clocks do not matter. Lossless."""
-    time_ns = (number + 1) * LEAST_GAP_NS
+    time_ns = (number + 1) * VIEW_INTERVAL_NS
     for name, image in images.items():
         height, width = image.pixels.shape[:2]
         if image.pixels.ndim == 3:

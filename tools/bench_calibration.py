@@ -239,23 +239,23 @@ def hand() -> str:
     base_from_tool = np.array([visp_pose(folder / f"pose_fPe_{k:02d}.yaml") for k in range(1, len(images) + 1)])
     text = "paper-hand    "
     published = published_lens(lens_views, size)
-    for name, lens, sure in (
+    for name, lens, accuracy in (
         ("our lens", own.model, LensAccuracy.stated(own.report.uncertainty)),
         ("published lens", published, LensAccuracy()),
     ):
-        text += f" {name}: {hand_against(lens, sure, found, base_from_tool, visp_pose(folder / 'eMc.yaml'))};"
+        text += f" {name}: {hand_against(lens, accuracy, found, base_from_tool, visp_pose(folder / 'eMc.yaml'))};"
     return text
 
 
 def hand_against(
     lens: CameraModel,
-    sure: LensAccuracy,
+    accuracy: LensAccuracy,
     found: Sequence[TargetView],
     base_from_tool: Float[Array, "n 4 4"],
     published_tool_from_camera: Float[Array, "4 4"],
 ) -> str:
     """How far the camera stands from its published place, and twice the deviation stated for it."""
-    solved = calibrate_hand_eye(lens, found, base_from_tool, "eye-in-hand", lens=sure)
+    solved = calibrate_hand_eye(lens, found, base_from_tool, "eye-in-hand", lens=accuracy)
     gap = solved.camera_from_mount @ published_tool_from_camera
     sure = solved.report.uncertainty
     return (

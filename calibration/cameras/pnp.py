@@ -96,7 +96,7 @@ def connected(
                 [there_pose @ inverse_poses(here_pose) for there_pose in q for here_pose in p]
                 for p, q in zip(poses[here], poses[there])
             ]
-            agreed = most_agreed([poses for poses in relative if poses], 5.0, 0.05)
+            agreed = most_agreed([of_view for of_view in relative if of_view], 5.0, 0.05)
             if agreed is not None and (best is None or agreed[1] > best[0]):
                 best = (agreed[1], there, agreed[0] @ found[here])
         if best is None or best[0] < LEAST_SHARED:

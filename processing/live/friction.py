@@ -34,8 +34,8 @@ CONTACTS, POINTS = 6, 24
 
 @dataclass(frozen=True)
 class LawSoFar:
-    """Friction and restitution with half their 95 % intervals; `information` on friction by toss (curvature
-    of its score over log friction; nothing where it said nothing), by toss."""
+    """Friction and restitution with half their 95 % intervals; `information` on friction by toss: the curvature of its
+    score over log friction, nothing where it said nothing."""
 
     friction: float
     friction_half: float

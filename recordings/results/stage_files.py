@@ -32,6 +32,14 @@ def stage_arrays(path: Path) -> Iterator[Any]:
         yield stored
 
 
+def read_arrays(path: Path) -> dict[str, Any]:
+    """Every array of an .npz by name; none where there is no such file. Raises DamagedFile."""
+    if not path.exists():
+        return {}
+    with stage_arrays(path) as stored:
+        return {name: stored[name] for name in stored.files}
+
+
 def stage_document(path: Path) -> Mapping[str, Any]:
     """A JSON object. Raises BadInput where it cannot be opened, DamagedFile where it is none."""
     document = read_json(path, f"; {AGAIN}")

@@ -10,10 +10,8 @@ Both are optional: what is not there is not shown.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -21,7 +19,7 @@ from numpy import ndarray as Array
 
 from recordings.errors import BadInput, DamagedFile
 from recordings.results.folder import Results
-from recordings.results.stage_files import stage_arrays
+from recordings.results.stage_files import read_arrays
 from recordings.whole_file import write_bytes
 
 FIT, NOTES = "toss_{:02d}.fit.npz", "toss_{:02d}.notes.npz"
@@ -84,7 +82,7 @@ def write_notes(folder: Path, toss: int, rejected: Rejected, matches: Matches) -
 
 def read_notes(folder: Path, toss: int) -> TrackNotes | None:
     """The notes of a toss in a track's folder; None where the tracker kept none. Raises DamagedFile."""
-    fit, notes = _arrays(folder / FIT.format(toss)), _arrays(folder / NOTES.format(toss))
+    fit, notes = read_arrays(folder / FIT.format(toss)), read_arrays(folder / NOTES.format(toss))
     if not fit:
         return None
     try:
@@ -94,13 +92,6 @@ def read_notes(folder: Path, toss: int) -> TrackNotes | None:
         return TrackNotes(fit["cost"], fit["on_surface"], keyframes, rejected, matches)
     except KeyError as wrong:
         raise DamagedFile(f"{folder}: the notes of toss {toss} lack {wrong}; run toss-process again") from wrong
-
-
-def _arrays(path: Path) -> Mapping[str, Any]:
-    if not path.exists():
-        return {}
-    with stage_arrays(path) as stored:
-        return {name: stored[name] for name in stored.files}
 
 
 def find_notes(results: Results, stage: str, toss: int) -> TrackNotes | None:

@@ -36,11 +36,11 @@ def body_point(
     if len(at_ns) == 0:
         return _center(body, toss)
     followed = poses[:, :3, :3] @ _center(reference, toss) + poses[:, :3, 3]
-    known = np.isfinite(matrices).all(axis=(1, 2)) & (times_ns >= at_ns[0]) & (times_ns <= at_ns[-1])
-    if not known.any():
+    common = np.isfinite(matrices).all(axis=(1, 2)) & (times_ns >= at_ns[0]) & (times_ns <= at_ns[-1])
+    if not common.any():
         return _center(body, toss)
-    then = np.stack([np.interp(times_ns[known], at_ns, axis) for axis in followed.T], axis=1)
-    own = np.einsum("nji,nj->ni", matrices[known, :3, :3], then - matrices[known, :3, 3])
+    then = np.stack([np.interp(times_ns[common], at_ns, axis) for axis in followed.T], axis=1)
+    own = np.einsum("nji,nj->ni", matrices[common, :3, :3], then - matrices[common, :3, 3])
     point: Float[Array, "3"] = np.median(own, axis=0)
     return point
 

@@ -25,7 +25,7 @@ from numpy import ndarray as Array
 
 from recordings.errors import BadInput
 from recordings.results.folder import Results, VariantRecord, read_shape, read_track
-from recordings.results.stage_files import stage_arrays, stage_file
+from recordings.results.stage_files import read_arrays, stage_file
 from recordings.tracks import ObjectShape, ObjectTrack
 
 ALIGNED = "aligned"
@@ -237,10 +237,7 @@ class _Reader:
     def _read(self, path: Path) -> Mapping[str, Any]:
         """Every array of a file; nothing where there is none."""
         if path not in self._arrays:
-            self._arrays[path] = {}
-            if path.exists():
-                with stage_arrays(path) as stored:
-                    self._arrays[path] = {name: stored[name] for name in stored.files}
+            self._arrays[path] = read_arrays(path)
         return self._arrays[path]
 
 

@@ -307,5 +307,5 @@ def _corrected(
 
 
 def _rotation_vectors(mean: Float[Array, "m a 3 3"], rotation: Float[Array, "m a s 3 3"]) -> Float[Array, "m a s 3"]:
-    """Rotation vectors from the middle to each."""
+    """Rotation vectors (rad) from the mean to each, in the mean's axes."""
     return rotation_vectors(np.swapaxes(mean, -1, -2)[:, :, None] @ rotation)

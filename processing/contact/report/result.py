@@ -109,15 +109,14 @@ def result_text(learning: ContactLearning, evaluation: Evaluation | None, warnin
     edges = " x ".join(f"{s.value * 1e3:.1f}" for s in learning.extents)
     half = ", ".join(f"{(s.high - s.low) / 2e-3:.1f}" for s in learning.extents)
     lines = [f"warning: {w}" for w in (*(n.text for n in in_order(warnings_of(learning))), *warnings)]
+    rebound = []
+    if e is not None:
+        rebound = [f"rebound   restitution {e.value:.2f} (95 %: {e.low:.2f} .. {e.high:.2f}; {RESTITUTION_ASSUMED})"]
     lines += [
         f"learned from {len(learning.tosses)} tosses, {learning.transitions} transitions ({learning.geometry})",
         f"size      {edges} mm (95 %: +- {half})",
         f"friction  {f.value:.3f} (95 %: {f.low:.3f} .. {f.high:.3f}; {learning.spread.method})",
-        *(
-            []
-            if e is None
-            else [f"rebound   restitution {e.value:.2f} (95 %: {e.low:.2f} .. {e.high:.2f}; {RESTITUTION_ASSUMED})"]
-        ),
+        *rebound,
         f"plane     1 mm higher makes the size {learning.plane_sensitivity['mean_extent_m_per_m']:+.2f} mm",
         f"physics   {learning.model.physics_source}; weight of dissipation {learning.weights.dissipation:g}",
         f"fit       {learning.cpu_seconds:.1f} CPU-s, {learning.solver_failures} unsolved inner problems",
