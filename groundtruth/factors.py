@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray as Array
 
+from calibration.cameras.poses import inverse_poses
 from groundtruth import se3
 
 Terms = tuple[Array, list[Array], Array]
@@ -133,7 +134,7 @@ def prior_terms(priors: list[Prior], poses: Array) -> Terms:
     index = np.array([[p.pose] for p in priors])
     root = np.stack([p.root_information for p in priors])
     mean = np.stack([p.mean for p in priors])
-    error = se3.log(se3.inverse(mean) @ poses[index[:, 0]])
+    error = se3.log(inverse_poses(mean) @ poses[index[:, 0]])
     return (root @ error[..., None])[..., 0], [root @ _right_jacobian_inverse(error)], index
 
 
@@ -142,10 +143,10 @@ def between_terms(betweens: list[Between], poses: Array) -> Terms:
     index = np.array([[b.pose_a, b.pose_b] for b in betweens])
     root = np.stack([b.root_information for b in betweens])
     delta = np.stack([b.delta for b in betweens])
-    relative = se3.inverse(poses[index[:, 0]]) @ poses[index[:, 1]]
-    error = se3.log(se3.inverse(delta) @ relative)
+    relative = inverse_poses(poses[index[:, 0]]) @ poses[index[:, 1]]
+    error = se3.log(inverse_poses(delta) @ relative)
     by_b = root @ _right_jacobian_inverse(error)
-    by_a = -by_b @ se3.adjoint(se3.inverse(relative))
+    by_a = -by_b @ se3.adjoint(inverse_poses(relative))
     return (root @ error[..., None])[..., 0], [by_a, by_b], index
 
 

@@ -20,6 +20,7 @@ from numpy import ndarray as Array
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
+from calibration.cameras.poses import inverse_poses
 from groundtruth import se3
 from groundtruth.blocks import BlockPattern
 from groundtruth.factors import (
@@ -262,8 +263,8 @@ class _System:
         """Residuals (m, 4, 2), points in the body, rig and camera frames (m, 4, 3)."""
         camera, rig, body, tag = (poses[self._chain[:, i]] for i in range(4))
         in_body = move(tag, self._corners)
-        in_rig = move(se3.inverse(rig), move(body, in_body))
-        in_camera = move(se3.inverse(camera), in_rig)
+        in_rig = move(inverse_poses(rig), move(body, in_body))
+        in_camera = move(inverse_poses(camera), in_rig)
         return self._project(in_camera) - self._seen, in_body, in_rig, in_camera
 
     def _project(self, points: Float[Array, "m k 3"]) -> Float[Array, "m k 2"]:

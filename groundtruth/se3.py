@@ -20,15 +20,6 @@ def skew(v: Float[Array, "*n 3"]) -> Float[Array, "*n 3 3"]:
     return out
 
 
-def inverse(poses: Float[Array, "*n 4 4"]) -> Float[Array, "*n 4 4"]:
-    out = np.zeros_like(poses)
-    turned = np.swapaxes(poses[..., :3, :3], -1, -2)
-    out[..., :3, :3] = turned
-    out[..., :3, 3] = -(turned @ poses[..., :3, 3:])[..., 0]
-    out[..., 3, 3] = 1
-    return out
-
-
 def exp(xi: Float[Array, "n 6"]) -> Float[Array, "n 4 4"]:
     """Rotation by Rodrigues' formula, translation by the left Jacobian of SO(3)."""
     out = np.zeros((len(xi), 4, 4))

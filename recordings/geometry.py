@@ -110,6 +110,20 @@ def nearest_rotation(matrix: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
     return rotation if off > 1e-12 else matrix.copy()  # what is exact comes back from a file to the last bit
 
 
+def rigid_fit(source_m: Float[Array, "*b n 3"], target_m: Float[Array, "*b n 3"]) -> Float[Array, "*b 4 4"]:
+    """Least-squares rotation and shift that lay source on target (Kabsch 1976), for any number of sets at once."""
+    a, b = source_m.mean(-2, keepdims=True), target_m.mean(-2, keepdims=True)
+    u, _, vt = np.linalg.svd(np.swapaxes(source_m - a, -1, -2) @ (target_m - b))
+    v, ut = np.swapaxes(vt, -1, -2), np.swapaxes(u, -1, -2)
+    sign = np.ones((*u.shape[:-2], 3))
+    sign[..., 2] = np.sign(np.linalg.det(v @ ut))
+    out = np.zeros((*u.shape[:-2], 4, 4))
+    out[..., :3, :3] = (v * sign[..., None, :]) @ ut
+    out[..., :3, 3] = b[..., 0, :] - (out[..., :3, :3] @ a[..., 0, :, None])[..., 0]
+    out[..., 3, 3] = 1
+    return out
+
+
 def rotation_from_quaternion(quaternion_wxyz: Float[Array, "4"]) -> Float[Array, "3 3"]:
     """Rotation of a quaternion wxyz of any non-zero length. Raises BadInput for zero or NaN."""
     q = np.asarray(quaternion_wxyz, dtype=np.float64)

@@ -229,3 +229,9 @@ class ContactModel:
     physics_source: str
     plane_normal_world: Float[Array, "3"]
     plane_offset_m: float
+
+
+def runs(chosen: Bool[Array, " n"]) -> list[tuple[int, int]]:
+    """Where runs of True begin, and the position after each."""
+    edges = np.flatnonzero(np.diff(np.r_[False, chosen, False].astype(int)))
+    return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2])]

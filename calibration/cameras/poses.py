@@ -24,6 +24,7 @@ def log_poses(poses: Float[Array, "n 4 4"]) -> Float[Array, "n 6"]:
 
 
 def inverse_poses(poses: Float[Array, "*n 4 4"]) -> Float[Array, "*n 4 4"]:
+    """Of rigid motions (R, t): (R', -R' t)."""
     out = np.zeros_like(poses)
     turned = np.swapaxes(poses[..., :3, :3], -1, -2)
     out[..., :3, :3] = turned

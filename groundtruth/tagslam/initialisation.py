@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray as Array
 
+from calibration.cameras.poses import inverse_poses
 from groundtruth import se3
 from groundtruth.factors import CORNERS
 from groundtruth.tagslam.problem import Key, Observation, Problem, camera_key, tag_key
@@ -158,10 +159,10 @@ class Initialisation:
         eye, rig, body, tag = (poses[self._chains[chosen, i]] for i in range(4))
         same = np.broadcast_to(np.eye(4), eye.shape)
         left, right = {
-            EYE: lambda: (same, se3.inverse(rig) @ body @ tag),
-            RIG: lambda: (se3.inverse(eye), body @ tag),
-            BODY: lambda: (se3.inverse(rig @ eye), tag),
-            TAG: lambda: (se3.inverse(rig @ eye) @ body, same),
+            EYE: lambda: (same, inverse_poses(rig) @ body @ tag),
+            RIG: lambda: (inverse_poses(eye), body @ tag),
+            BODY: lambda: (inverse_poses(rig @ eye), tag),
+            TAG: lambda: (inverse_poses(rig @ eye) @ body, same),
         }[place]()
         return _Ready(
             left,
@@ -179,7 +180,9 @@ class Initialisation:
     def _propose(self, key: Key, ready: _Ready, stage: Stage) -> Float[Array, "4 4"] | None:
         proposers = range(min(len(ready.candidates), self.config.most_proposers))
         candidates = [
-            se3.inverse(ready.left[i]) @ c @ se3.inverse(ready.right[i]) for i in proposers for c in ready.candidates[i]
+            inverse_poses(ready.left[i]) @ c @ inverse_poses(ready.right[i])
+            for i in proposers
+            for c in ready.candidates[i]
         ]
         if not candidates:
             return None
@@ -196,14 +199,14 @@ class Initialisation:
                 return None
             near = self._neighbour(key)
             if near is not None:
-                near = se3.inverse(near) if ready.inverted else near
+                near = inverse_poses(near) if ready.inverted else near
                 x = min(proposals, key=lambda pose: _turn(near, pose))
         elif len(ready.camera) > 1:
             x, score = self._refined(ready, x, float(score), stage.agreeing)
         focal_px = self.problem.config.cameras[ready.camera[0]].model.fx
         if stage.strictness * score > max(self.config.accept_px, self.config.accept_rad * focal_px):
             return None
-        return se3.inverse(x) if ready.inverted else x
+        return inverse_poses(x) if ready.inverted else x
 
     def _scores(self, ready: _Ready, proposals: Float[Array, "m 4 4"], agreeing: float) -> Float[Array, " m"]:
         """The mean corner error (capped) that this share of the observations does not exceed."""

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray as Array
 
-from recordings.geometry import rotation_angle_rad
+from recordings.geometry import rigid_fit, rotation_angle_rad
 
 if TYPE_CHECKING:
     import trimesh
@@ -165,22 +165,12 @@ def icp_align(
         for _ in range(most):
             distance, nearest = tree.query(moved)
             use = distance <= np.quantile(distance, share)
-            total = _kabsch(moved[use], target_m[nearest[use]]) @ total
+            total = rigid_fit(moved[use], target_m[nearest[use]]) @ total
             after = points @ total[:3, :3].T + total[:3, 3]
             way_m, moved = float(np.abs(after - moved).max()), after
             if way_m < 1e-7:
                 break
     return total
-
-
-def _kabsch(source_m: Float[Array, "n 3"], target_m: Float[Array, "n 3"]) -> Float[Array, "4 4"]:
-    """The rigid motion that moves paired points onto each other with least squares (Kabsch 1976)."""
-    a, b = source_m.mean(0), target_m.mean(0)
-    u, _, vt = np.linalg.svd((source_m - a).T @ (target_m - b))
-    turn = vt.T @ np.diag([1, 1, np.sign(np.linalg.det(vt.T @ u.T))]) @ u.T
-    out = np.eye(4)
-    out[:3, :3], out[:3, 3] = turn, b - turn @ a
-    return out
 
 
 def biggest_component(mesh: trimesh.Trimesh) -> trimesh.Trimesh:

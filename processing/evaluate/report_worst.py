@@ -19,7 +19,7 @@ from processing.motion.frame_phases import Phase
 from processing.motion.thresholds import MOVING_M_S
 from recordings.results.folder import Results
 from recordings.results.track_notes import find_notes
-from recordings.tracks import ObjectTrack
+from recordings.tracks import ObjectTrack, runs
 
 WORST = 6
 LEAST_FRAMES_BETWEEN = 4
@@ -58,7 +58,7 @@ class Worst:
 def worst_frames(results: Results, row: Row) -> list[Worst]:
     """The worst frames of a row, worst first: runs of lost ones (a half of them at most), then by error or fit."""
     every = {toss: diagnostics(results, row, toss) for toss in row.tracks}
-    lost = sorted(((b - a, t, a) for t, e in every.items() for a, b in lost_runs(e.track)), reverse=True)
+    lost = sorted(((b - a, t, a) for t, e in every.items() for a, b in runs(e.track.lost)), reverse=True)
     found = [_lost(every[t], a, a + n) for n, t, a in lost[: WORST // 2]]
     ranked = sorted(
         ((s, t, i) for t, e in every.items() for i, s in enumerate(_severity(e)) if np.isfinite(s)), reverse=True
@@ -115,12 +115,6 @@ def _severity(e: TossDiagnostics) -> Float[Array, " n"]:
     known = np.isfinite(e.error_m).any()
     bad = 1e3 * e.error_m + e.error_deg if known else e.residual
     return np.where(e.track.lost, np.nan, bad)
-
-
-def lost_runs(track: ObjectTrack) -> list[tuple[int, int]]:
-    """First frame of every run of lost ones, and the frame after its last."""
-    edges = np.flatnonzero(np.diff(np.r_[False, track.lost, False].astype(int)))
-    return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2])]
 
 
 def _lost(e: TossDiagnostics, first: int, after: int) -> Worst:

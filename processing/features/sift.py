@@ -16,6 +16,7 @@ from numpy import ndarray as Array
 from processing.sensor import view_layout as lay
 from processing.sensor.view import Crop, ViewStore
 from recordings.constants import LUMA
+from recordings.geometry import rigid_fit
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,20 +118,6 @@ def lifted(store: ViewStore, view: int, uv: Float[Array, "n 2"]) -> tuple[Float[
     x = (uv[:, 0] + crop.corner[0] - c.cx) / c.fx
     y = (uv[:, 1] + crop.corner[1] - c.cy) / c.fy
     return np.stack([x * z, y * z, z], -1), z > 0
-
-
-def rigid_fit(source_m: Float[Array, "*b n 3"], target_m: Float[Array, "*b n 3"]) -> Float[Array, "*b 4 4"]:
-    """Least-squares rotation and shift that lay source on target (Kabsch 1976), for any number of sets at once."""
-    a, b = source_m.mean(-2, keepdims=True), target_m.mean(-2, keepdims=True)
-    u, _, vt = np.linalg.svd(np.swapaxes(source_m - a, -1, -2) @ (target_m - b))
-    v, ut = np.swapaxes(vt, -1, -2), np.swapaxes(u, -1, -2)
-    sign = np.ones((*u.shape[:-2], 3))
-    sign[..., 2] = np.sign(np.linalg.det(v @ ut))
-    out = np.zeros((*u.shape[:-2], 4, 4))
-    out[..., :3, :3] = (v * sign[..., None, :]) @ ut
-    out[..., :3, 3] = b[..., 0, :] - (out[..., :3, :3] @ a[..., 0, :, None])[..., 0]
-    out[..., 3, 3] = 1
-    return out
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray as Array
 
+from processing.motion.rotation_grid import directions
 from processing.sensor.noise import stereo_sigma_m
 from recordings.geometry import Transform
 from recordings.tracks import ObjectTrack
@@ -32,14 +33,6 @@ NAMES = ("lies on the table", "is up", "faces the camera", "is turned away from 
 """Sides of the object as it lies now, seen from the camera."""
 
 
-def directions() -> Float[Array, "d 3"]:
-    """Unit vectors spread evenly over the sphere (Fibonacci's spiral)."""
-    k = np.arange(DIRECTIONS) + 0.5
-    z, turn = 1 - 2 * k / DIRECTIONS, np.pi * (1 + 5**0.5) * k
-    across = np.sqrt(1 - z * z)
-    return np.stack([across * np.cos(turn), across * np.sin(turn), z], -1)
-
-
 @dataclass(frozen=True, eq=False)
 class TossSides:
     """Information (1/variance, 1/m^2) that one toss gives on the surface in each direction: in the object frame, and
@@ -54,7 +47,7 @@ def sides_of(
     track: ObjectTrack, center_m: Float[Array, "3"], world_from_camera: Transform | None, impact: int | None
 ) -> TossSides:
     """Of one toss whose track is in the shared object frame."""
-    around, kept = directions(), [i for i, s in enumerate(track.status) if s == "tracked"]
+    around, kept = directions(DIRECTIONS), [i for i, s in enumerate(track.status) if s == "tracked"]
     best, total = np.zeros(DIRECTIONS), np.zeros(DIRECTIONS)
     touched = np.zeros(DIRECTIONS, dtype=bool)
     for i in kept:
@@ -75,7 +68,7 @@ def sides_of(
 
 def _turned(information: Float[Array, " d"], new_from_old: Float[Array, "3 3"]) -> Float[Array, " d"]:
     """A map over directions in other axes."""
-    around = directions()
+    around = directions(DIRECTIONS)
     return information[np.argmax(around @ new_from_old @ around.T, axis=1)]
 
 
@@ -102,7 +95,7 @@ def next_starts(
     """The six sides of the object as it lies now (its last pose), best start first. A toss is expected to show what
     those so far have shown, turned with the side that it begins with."""
     information, touched = sum(t.information for t in tosses), np.any([t.touched for t in tosses], axis=0)
-    pattern, around = np.mean([t.pattern for t in tosses], axis=0), directions()
+    pattern, around = np.mean([t.pattern for t in tosses], axis=0), directions(DIRECTIONS)
     rotation, at = camera_from_object[:3, :3], camera_from_object[:3, :3] @ center_m + camera_from_object[:3, 3]
     to_camera = -at / np.linalg.norm(at)
     found = []

@@ -104,10 +104,15 @@ def _flight_misfit(series: PoseSeries, inertia: Float[Array, "3 3"], noise: Nois
 
 def spin_residual(series: PoseSeries, inertia: Float[Array, "3 3"]) -> Float[Array, "m 3"]:
     """w[k+1] - w[k] + dt I^-1 (w x I w), in object axes, for every three frames: zero where no torque acts."""
+    return np.diff(differences(series).spin_object_rad_s[1:], axis=0) - torque_free_change(series, inertia)
+
+
+def torque_free_change(series: PoseSeries, inertia: Float[Array, "3 3"]) -> Float[Array, "m 3"]:
+    """-dt I^-1 (w x I w), in rad/s and object axes, for every three frames: how a free body's spin w changes."""
     spin = differences(series).spin_object_rad_s[1:]
     middle = 0.5 * (spin[1:] + spin[:-1])
     free = -np.linalg.solve(inertia, np.cross(middle, middle @ inertia).T).T
-    return np.diff(spin, axis=0) - np.diff(series.time_s)[1:, None] * free
+    return np.diff(series.time_s)[1:, None] * free
 
 
 def _rest_misfit(series: PoseSeries, noise: Noise) -> Float[Array, "n n"]:

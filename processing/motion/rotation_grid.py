@@ -9,13 +9,17 @@ from numpy import ndarray as Array
 from recordings.geometry import rotation_exp
 
 
-def turn_grid(angles_deg: tuple[float, ...], axes: int) -> Float[Array, "n 3 3"]:
-    """Rotations by each angle about axes spread evenly over the sphere (Fibonacci)."""
-    n = np.arange(axes) + 0.5
-    z, phi = 1 - 2 * n / axes, np.pi * (1 + 5**0.5) * n
+def directions(count: int) -> Float[Array, "n 3"]:
+    """Unit vectors spread evenly over the sphere (Fibonacci's spiral)."""
+    n = np.arange(count) + 0.5
+    z, phi = 1 - 2 * n / count, np.pi * (1 + 5**0.5) * n
     r = np.sqrt(1 - z * z)
-    directions = np.stack([r * np.cos(phi), r * np.sin(phi), z], -1)
-    return np.array([rotation_exp(d * np.radians(a)) for a in angles_deg for d in directions])
+    return np.stack([r * np.cos(phi), r * np.sin(phi), z], -1)
+
+
+def turn_grid(angles_deg: tuple[float, ...], axes: int) -> Float[Array, "n 3 3"]:
+    """Rotations by each angle about axes spread evenly over the sphere."""
+    return np.array([rotation_exp(d * np.radians(a)) for a in angles_deg for d in directions(axes)])
 
 
 def all_turns(count: int) -> Float[Array, "n 3 3"]:

@@ -21,7 +21,7 @@ from numpy import ndarray as Array
 from scipy import sparse
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
-from processing.motion.phases import Noise, Phases, find_phases, pose_noise
+from processing.motion.phases import Noise, Phases, find_phases, pose_noise, torque_free_change
 from processing.motion.trajectory import (
     PoseSeries,
     States,
@@ -140,7 +140,7 @@ def _smooth_rotation(
     for _ in range(ROUNDS):
         here = PoseSeries(series.toss, series.time_s, rotation, series.position_m)
         J = _spin_jacobian(rotation, dt)
-        change = np.where(flying[:, None], _torque_free(here, inertia), 0.0)
+        change = np.where(flying[:, None], torque_free_change(here, inertia), 0.0)
         residual = (np.diff(differences(here).spin_object_rad_s[1:], axis=0) - change).ravel()
         W = sparse.diags_array(1 / np.repeat(sigma, 3) ** 2) @ J
         moved = rotation_vectors(np.swapaxes(series.rotation, 1, 2) @ rotation).ravel()
@@ -159,13 +159,6 @@ def _smooth_rotation(
         :, None, None
     ] ** 2
     return rotation, covariance[np.arange(n), np.arange(n)], np.concatenate([spin[:1], spin])
-
-
-def _torque_free(series: PoseSeries, inertia: Float[Array, "3 3"]) -> Float[Array, "m 3"]:
-    spin = differences(series).spin_object_rad_s[1:]
-    middle = 0.5 * (spin[1:] + spin[:-1])
-    free = -np.linalg.solve(inertia, np.cross(middle, middle @ inertia).T).T
-    return np.diff(series.time_s)[1:, None] * free
 
 
 def _spin_jacobian(rotation: Float[Array, "n 3 3"], dt: Float[Array, " m"]) -> sparse.csr_array:

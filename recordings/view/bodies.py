@@ -6,11 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 import rerun as rr
-from jaxtyping import Bool, Float, Int64
+from jaxtyping import Float, Int64
 from numpy import ndarray as Array
 
 from recordings.geometry import CameraModel, Transform, quaternion_from_rotation, rotation_angle_rad
-from recordings.tracks import TagPlacement
+from recordings.tracks import TagPlacement, runs
 from recordings.view.body_point import at_same_point
 from recordings.view.layers import CAMERA, MOTION, Clock, Look, image_entity, plotted
 from recordings.view.mesh import outline_px, shaded_mesh
@@ -114,12 +114,6 @@ def log_poses(
         wxyz = np.array([quaternion_from_rotation(m[:3, :3]) for m in matrices[known]])
         columns = rr.Transform3D.columns(translation=matrices[known, :3, 3], quaternion=wxyz[:, [1, 2, 3, 0]])
         clock.columns(entity, times_ns[known], columns)
-
-
-def runs(known: Bool[Array, " n"]) -> list[tuple[int, int]]:
-    """Where runs of True begin, and the position after each."""
-    edges = np.flatnonzero(np.diff(np.r_[False, known, False].astype(int)))
-    return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2])]
 
 
 def log_shape(clock: Clock, body: Body, time_ns: int, half_m: float | None) -> None:

@@ -19,7 +19,7 @@ from processing.evaluate.report import write_report
 from processing.evaluate.report_loops import SLOWED, chosen_frames, flight_cut, loop_images, toss_loops
 from processing.evaluate.report_mesh import MOST_FACES, thinned
 from processing.evaluate.report_shapes import UNSEEN_RGB, Shown
-from processing.evaluate.report_worst import TossDiagnostics, lost_runs, reasons, worst_frames
+from processing.evaluate.report_worst import TossDiagnostics, reasons, worst_frames
 from processing.evaluate.score import TossScore, VariantScore
 from processing.evaluate.table import Row, table_document
 from recordings.film.film import STATUS_RGB
@@ -33,7 +33,7 @@ from recordings.results.folder import (
     write_variant,
 )
 from recordings.session import Session
-from recordings.tracks import ObjectShape, ObjectTrack
+from recordings.tracks import ObjectShape, ObjectTrack, runs
 
 FRAMES, LOST, GUESSED, WORST = 8, 3, 4, 6
 STATUS = tuple("lost" if i == LOST else "interpolated" if i == GUESSED else "tracked" for i in range(FRAMES))
@@ -234,8 +234,8 @@ def test_a_reason_names_what_is_unusual_and_nothing_else(made, name, value, said
 
 def test_runs_of_lost_frames_are_found(made):
     track = made[1].tracks[0]
-    assert lost_runs(track) == [(LOST, LOST + 1)]
-    assert lost_runs(ObjectTrack.nowhere(0, "d455", track.time_ns)) == [(0, FRAMES)]
+    assert runs(track.lost) == [(LOST, LOST + 1)]
+    assert runs(ObjectTrack.nowhere(0, "d455", track.time_ns).lost) == [(0, FRAMES)]
 
 
 def test_friction_restitution_and_rollouts_stand_in_one_table_with_their_intervals(made):

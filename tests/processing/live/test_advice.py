@@ -6,7 +6,8 @@ import numpy as np
 
 from processing.live.advice import Throw, options
 from processing.live.friction import LawSoFar, shrink_by
-from processing.live.sides import DIRECTIONS, GUESS, directions, next_starts, sides_of, surface_sigma_m
+from processing.live.sides import DIRECTIONS, GUESS, next_starts, sides_of, surface_sigma_m
+from processing.motion.rotation_grid import directions
 from recordings.geometry import Transform, rotation_exp
 from recordings.tracks import ObjectTrack
 
@@ -26,10 +27,10 @@ def still(rotation: np.ndarray, frames: int = 6) -> ObjectTrack:
 
 def test_a_frame_tells_of_the_side_that_faces_the_camera_and_of_no_other() -> None:
     information = sides_of(still(np.eye(3)), CENTER, None, None).information
-    facing = directions() @ np.array([0, 0, -1.0])
+    facing = directions(DIRECTIONS) @ np.array([0, 0, -1.0])
     assert (information[facing > 0.5] > 0).all()
     assert (information[facing < 0.2] == 0).all()
-    assert directions()[information.argmax()] @ np.array([0, 0, -1.0]) > 0.98
+    assert directions(DIRECTIONS)[information.argmax()] @ np.array([0, 0, -1.0]) > 0.98
 
 
 def test_nothing_seen_leaves_the_guess_and_more_frames_only_help() -> None:
@@ -52,8 +53,8 @@ def test_a_side_is_touched_where_it_pointed_down_after_the_impact() -> None:
     track = still(np.eye(3))
     down = WORLD_FROM_CAMERA.rotation.T @ np.array([0, 0, -1.0])
     touched = sides_of(track, CENTER, WORLD_FROM_CAMERA, 2).touched
-    assert touched[(directions() @ down).argmax()]
-    assert not touched[(directions() @ down).argmin()]
+    assert touched[(directions(DIRECTIONS) @ down).argmax()]
+    assert not touched[(directions(DIRECTIONS) @ down).argmin()]
     assert not sides_of(track, CENTER, WORLD_FROM_CAMERA, None).touched.any()
 
 

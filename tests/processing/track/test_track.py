@@ -12,7 +12,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from processing.evaluate.metrics import align_first, frame_errors
-from processing.features.sift import rigid_fit
 from processing.motion import se3_kernels as se3
 from processing.motion.interpolate import moved, turn_between
 from processing.motion.motion_prior import (
@@ -37,7 +36,7 @@ from processing.track.revolution.axis import Axis
 from processing.track.track_file import read_toss_track, write_toss_track
 from processing.track.track_toss import TossTrack, TrackConfig, track_toss
 from recordings.errors import BadInput
-from recordings.geometry import CameraModel, Transform, rotation_exp
+from recordings.geometry import CameraModel, Transform, rigid_fit, rotation_exp
 from recordings.records import RgbdFrame
 
 COUNT = 10
