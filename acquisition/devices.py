@@ -29,7 +29,7 @@ from jaxtyping import Float, Int64, UInt8, UInt16
 from numpy import ndarray as Array
 
 from recordings.errors import TosslabError
-from recordings.geometry import CameraModel, Transform
+from recordings.geometry import CameraModel
 
 
 class DeviceLost(TosslabError):
@@ -184,7 +184,6 @@ class Motion:
     ticks: int = 0
     missed: int = 0
     started_host_ns: int | None = None
-    ended_host_ns: int | None = None
 
 
 @dataclass(frozen=True)
@@ -263,9 +262,6 @@ class RgbdCamera(Device, Protocol):
 
     def cameras(self) -> Mapping[str, CameraModel]:
         """The factory's intrinsics by stream: "color", "depth", "infrared1", "infrared2"."""
-
-    def color_from_depth(self) -> Transform:
-        """The factory's extrinsics of depth in the colour camera's optical frame (the identity when aligned)."""
 
 
 @runtime_checkable

@@ -101,7 +101,6 @@ class Solved:
     unplaced: tuple[str, ...]
     table_off_m: Mapping[int, float] = field(default_factory=dict)
     arcs: int = 0
-    noise_factor: float = field(default=1.0)
     displaced: tuple[str, ...] = ()
     """Cameras that do not stand where the calibration has them; what was seen placed them."""
     tension: float = 1.0
@@ -196,7 +195,7 @@ def _problem(
     stamps = tuple(sorted({o.stamp_ns for o in observations}))
     every = {**tags, **on_body}
     owner = {**dict.fromkeys(tags, world), **dict.fromkeys(on_body, body)}
-    return Problem(tagslam, stamps, observations, every, owner, {}, 0, 0)
+    return Problem(tagslam, stamps, observations, every, owner, {}, 0)
 
 
 def _camera(name: str, calibration: RigCalibration, config: SolveConfig) -> CameraEntry:
@@ -352,7 +351,6 @@ def _solved(
             if tag.pose is not None and tag_key(i) in index
         },
         arcs=len(in_flight),
-        noise_factor=factor,
     )
 
 

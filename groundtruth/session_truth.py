@@ -42,7 +42,6 @@ from recordings.session_writer import write_truth
 from recordings.sync import clock_offset_ns
 from recordings.whole_file import write_json
 
-TRUTH = "truth"
 LATE_S = 0.0007
 """Mono stamps that are off by more are told: 1 ms is 2 mm and 0.7 degrees."""
 

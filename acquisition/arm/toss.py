@@ -64,8 +64,8 @@ class TossPlan:
     """A toss that the arm can do. Times count from the trajectory's start.
 
     `release_s` is when the fingers are to begin to open, `command_s` when the gripper has to be told so that they do.
-    The velocities are those of the tool at `release_s`, in the world. `delay_sigma_s`: how well the gripper's delay is
-    known; around the release the joints' speeds stay constant for `window_s`.
+    The velocities are those of the tool at `release_s`, in the world. The joints' speeds stay constant for `window_s`
+    around the release.
     """
 
     trajectory: JointTrajectory
@@ -74,7 +74,6 @@ class TossPlan:
     world_from_tool: Transform
     linear_velocity_world_m_s: Float[Array, "3"]
     angular_velocity_world_rad_s: Float[Array, "3"]
-    delay_sigma_s: float = float("nan")
     window_s: float = 0.0
 
 
@@ -151,7 +150,6 @@ def plan_toss(model: ArmModel, space: Space, target: TossTarget, delay: ReleaseD
                     target.world_from_tool,
                     target.linear_velocity_world_m_s,
                     target.angular_velocity_world_rad_s,
-                    delay.sigma_s,
                     window_s,
                 )
         best = best or breach

@@ -42,9 +42,6 @@ class Take:
     lines: dict[tuple[str, str, int], ClockLine] = field(default_factory=dict)
     marks: list[threading.Event] = field(default_factory=list)
 
-    def holds(self, host_ns: int) -> bool:
-        return self.begin_host_ns <= host_ns and (self.end_host_ns is None or host_ns <= self.end_host_ns)
-
 
 Write = Callable[[Take, Item], int]
 """Writes an item; returns how many of its parts were written (the rest it has counted as dropped)."""

@@ -73,9 +73,9 @@ class ArmBody:
             end_ns = self._started_ns + round(self._trajectory.duration_s * 1e9)
             ticks = round(max(min(time.monotonic_ns(), end_ns) - self._started_ns, 0) / 1e6)
             if self._halted_ns is not None:
-                return Motion("aborted", self.reason, ticks, 0, self._started_ns, self._halted_ns)
+                return Motion("aborted", self.reason, ticks, 0, self._started_ns)
             if self._over():
-                return Motion("done", "", ticks, 0, self._started_ns, end_ns)
+                return Motion("done", "", ticks, 0, self._started_ns)
             return Motion("moving", "", ticks, 0, self._started_ns)
 
     def states(self, host_ns: Int64[Array, " n"]) -> tuple[Float[Array, "n j"], Float[Array, "n j"]]:

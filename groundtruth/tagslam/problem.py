@@ -65,7 +65,7 @@ class Observation:
 @dataclass(frozen=True, eq=False)
 class Problem:
     """`stamps`: where TagSLAM answers: all topics have a message, and a tag is seen or odometry is there.
-    `odometry[body][stamp]`: the odometry's pose. `incomplete_stamps`: stamps at which some topic had no message."""
+    `odometry[body][stamp]`: the odometry's pose."""
 
     config: TagSlamConfig
     stamps: tuple[int, ...]
@@ -74,7 +74,6 @@ class Problem:
     owner: dict[int, BodyEntry]
     odometry: Mapping[str, Mapping[int, Float[Array, "4 4"]]]
     ignored: int
-    incomplete_stamps: int
 
 
 def make_problem(config: TagSlamConfig, recording: Recording, most_frames: int | None = None) -> Problem:
@@ -88,7 +87,7 @@ def make_problem(config: TagSlamConfig, recording: Recording, most_frames: int |
             raise BadInput(
                 f"no detections on {camera.tag_topic} of {camera.name}; the recording has {sorted(recording.frames)}"
             )
-    sets, messages = _synchronised(config, recording)
+    sets = _synchronised(config, recording)
     collector = _Collector(config, recording)
     odometry: dict[str, dict[int, Float[Array, "4 4"]]] = {
         b.name: {} for b in config.bodies if b.odom_topic in recording.odometry
@@ -110,19 +109,16 @@ def make_problem(config: TagSlamConfig, recording: Recording, most_frames: int |
         collector.owner,
         odometry,
         collector.ignored,
-        messages - len(sets),
     )
 
 
-def _synchronised(config: TagSlamConfig, recording: Recording) -> tuple[list[StampSet], int]:
-    """Sets of stamps, one of each camera's topic and each odometry's, and how many different stamps there were."""
+def _synchronised(config: TagSlamConfig, recording: Recording) -> list[StampSet]:
+    """Sets of stamps, one of each camera's topic and each odometry's."""
     stamps: dict[str, list[int]] = {c.tag_topic: sorted(recording.frames[c.tag_topic]) for c in config.cameras}
     for body in config.bodies:
         if body.odom_topic is not None and body.odom_topic in recording.odometry:
             stamps[body.odom_topic] = [int(s) for s in recording.odometry[body.odom_topic][0]]
-    if config.approximate_sync:
-        return approximate_sets(stamps), max(len(s) for s in stamps.values())
-    return exact_sets(stamps), len(set().union(*stamps.values()))
+    return approximate_sets(stamps) if config.approximate_sync else exact_sets(stamps)
 
 
 class _Collector:

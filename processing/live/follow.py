@@ -107,9 +107,8 @@ def followed_alone(session: Path) -> Iterator[None]:
         except OSError as held:
             lock.seek(0)
             raise BadInput(
-                f"{session} is followed already, by process {lock.read().strip() or 'of another user'}; look at "
-                f"what it "
-                f"finds with `toss-view --live {session}`, or end it first"
+                f"{session} is followed already, by process {lock.read().strip() or 'of another user'}; look at what "
+                f"it finds with `toss-view --live {session}`, or end it first"
             ) from held
         lock.truncate(0)
         lock.write(f"{os.getpid()}\n")
@@ -309,5 +308,5 @@ def alive(process: int) -> bool:
     except ProcessLookupError:
         return False
     except PermissionError:
-        return True
+        pass  # it is there, and another user's
     return True

@@ -1,9 +1,8 @@
 """Which sides of the object were seen and touched so far, and how much another throw would add, by the covariances of
 what is there.
 
-A side is a direction in the object frame. A frame tells the surface there with the camera's depth noise over the
-cosine at
-which it faces the camera; frames of one toss err together, so that a toss counts as one frame of its best view and a
+A side is a direction in the object frame. A frame tells the surface there with the camera's depth noise over the cosine
+at which it faces the camera; frames of one toss err together, so that a toss counts as one frame of its best view and a
 tenth of all. What nobody saw is the hull's guess.
 """
 
@@ -18,7 +17,7 @@ from numpy import ndarray as Array
 
 from processing.motion.rotation_grid import directions
 from processing.sensor.noise import stereo_sigma_m
-from recordings.geometry import Transform
+from recordings.geometry import Transform, skew
 from recordings.tracks import ObjectTrack
 
 DIRECTIONS = 192
@@ -132,5 +131,5 @@ def _shortest(source: Float[Array, "3"], target: Float[Array, "3"]) -> Float[Arr
         axis = np.cross(source, other)
         axis /= np.linalg.norm(axis)
         return 2 * np.outer(axis, axis) - np.eye(3)
-    K = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
+    K = skew(axis)
     return np.asarray(np.eye(3) + K + K @ K / (1 + cosine))

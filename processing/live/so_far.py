@@ -31,10 +31,6 @@ class _KeptToss(Toss):
             )
         return self._frames[camera]
 
-    def forget(self) -> None:
-        """Let go of the decoded frames."""
-        self._frames.clear()
-
 
 class SessionSoFar(Session):
     """The finished tosses of a session that goes on. Nothing on disk changes, and none of the others is looked at."""
@@ -47,9 +43,3 @@ class SessionSoFar(Session):
         if toss not in self._open:
             self._open[toss] = _KeptToss(Toss(self.file(toss)))
         return self._open[toss]
-
-    def forget(self, toss: int) -> None:
-        """Let go of a toss's decoded frames."""
-        kept = self._open.get(toss)
-        if isinstance(kept, _KeptToss):
-            kept.forget()

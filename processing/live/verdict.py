@@ -142,9 +142,8 @@ def _blur(track: ObjectTrack, seen: Seen, config: LiveConfig) -> str:
         return ""
     moved = np.linalg.norm(np.diff(seen.center_px, axis=0), axis=1)
     return (
-        f"blurred in {blurred} frames (up to {np.nanmax(moved):.0f} pixels from frame to frame): a shorter "
-        f"exposure, or a "
-        "slower throw"
+        f"blurred in {blurred} frames (up to {np.nanmax(moved):.0f} pixels from frame to frame): a shorter exposure, "
+        "or a slower throw"
     )
 
 

@@ -39,7 +39,6 @@ DEPTH = f"observation.depth.{CAMERA}"
 POSE = "observation.object_pose"
 POSE_NAMES = ("x", "y", "z", "qx", "qy", "qz", "qw")
 CHUNK_FILES, DATA_MB, VIDEO_MB = 1000, 100, 200
-FILE = {"chunk_index": 0, "file_index": 0}
 
 
 @dataclass

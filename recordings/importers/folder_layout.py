@@ -26,7 +26,6 @@ class Layout:
     document: Mapping[str, Any]
     calibration: RigCalibration
     depth_unit_m: float
-    depth_aligned: bool
     object: Mapping[str, Any]
     mono: tuple[str, ...]
     mono_document: Mapping[str, Any]
@@ -58,8 +57,7 @@ def read_layout(source: Path, warnings: Warnings) -> Layout:
         raise BadInput(f"{path}: no 'camera'; wanted {{K, width, height, distortion, depth_unit_m}}")
     cameras = {"d455": camera_model(camera, "d455", str(path))}
     transforms = _transforms(document, path)
-    depth_aligned = bool(camera.get("depth_aligned_to_color", True))
-    if not depth_aligned:
+    if not camera.get("depth_aligned_to_color", True):
         cameras["d455_depth"], d455_from_depth = _depth_camera(document, path)
         transforms.append(d455_from_depth)
         warnings.add("depth is not aligned to colour: it is kept as it is and aligned with its calibration when read")
@@ -72,7 +70,6 @@ def read_layout(source: Path, warnings: Warnings) -> Layout:
         document=document,
         calibration=RigCalibration({**cameras, **mono}, tuple(transforms), tags, family),
         depth_unit_m=_depth_unit(camera, path),
-        depth_aligned=depth_aligned,
         object=_object(document.get("object"), path),
         mono=tuple(mono),
         mono_document=mono_document,

@@ -32,7 +32,6 @@ class TrueToss:
     folder: Path
     time_s: Float[Array, " n"]
     world_from_object: Float[Array, "n 4 4"]
-    d455_from_object: Float[Array, "n 4 4"]
     phase: tuple[str, ...]
     about: Mapping[str, Any]
 
@@ -73,7 +72,7 @@ def _read_toss(folder: Path) -> TrueToss:
             f"{path}: {len(time_s)} times, poses of shape {world.shape} and {d455.shape}; wanted as many 4x4"
         )
     about = read_json_object(folder / "toss_gt.json") if (folder / "toss_gt.json").exists() else {}
-    return TrueToss(int(folder.name[5:]), folder, time_s, world, d455, phase, about)
+    return TrueToss(int(folder.name[5:]), folder, time_s, world, phase, about)
 
 
 def import_truth(

@@ -37,9 +37,6 @@ SEEN, UNSEEN = (165, 185, 205), (225, 60, 50)
 COLORS = {"tracked": (60, 200, 90), "interpolated": (255, 150, 0)}
 OUTLINE_RGB = {"tracked": (60, 230, 100), "interpolated": (255, 150, 0)}
 POLL_S = 0.5
-EYE = np.array([0.35, -0.9, 0.55])
-DISTANCE = 2.6
-"""Of the eye from the shape, in its extents."""
 
 
 class SessionView:

@@ -214,7 +214,7 @@ class WorkerArm(OpenedByContext):
         where = self._arguments[0]
         self._inbox.lose(f"{self.name}: the arm at {where} is gone: {reason}; check its network, then reopen")
         if self._motion.status == "moving":
-            self._motion = replace(self._motion, status="aborted", reason=reason, ended_host_ns=time.monotonic_ns())
+            self._motion = replace(self._motion, status="aborted", reason=reason)
         if not self._opened.is_set():
             self._failure = ("ended", reason)
             self._opened.set()
@@ -227,5 +227,4 @@ def _motion(event: dict[str, Any]) -> Motion:
         event.get("ticks", 0),
         event.get("missed", 0),
         event["started"],
-        event.get("ended"),
     )

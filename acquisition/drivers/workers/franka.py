@@ -129,7 +129,6 @@ class Follower:
             ticks=self._calls,
             missed=self._missed,
             started=started,
-            ended=time.monotonic_ns(),
         )
         return not self._quit
 

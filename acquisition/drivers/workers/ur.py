@@ -249,7 +249,6 @@ class Follower:
             ticks=self._ticks,
             missed=self._missed,
             started=self._started,
-            ended=time.monotonic_ns(),
         )
         return True
 

@@ -72,12 +72,11 @@ class TracksConfig:
 class TrackLearning:
     """What contact learning on vision's tracks gives. Everything is in the object frame of the tracks.
 
-    `shape` has vision's triangles, moved by `moved_m` (metres, per vertex) where contact knew better; `support` is the
-    contact geometry as a mesh. `learning` is that of contact alone, `fused` the same with the fused geometry.
+    `shape` has vision's triangles, moved by `moved_m` (metres, per vertex) where contact knew better. `learning` is
+    that of contact alone, `fused` the same with the fused geometry.
     """
 
     shape: ObjectShape
-    support: ObjectShape
     model: ContactModel
     moved_m: Float[Array, " v"]
     rollouts: Evaluation
@@ -144,9 +143,7 @@ def learn_from_series(
     left_out = {**(left_out or {}), **learning.left_out}
     length = np.linalg.norm(moved, axis=1)
     document = _document(learning, fused, rollouts, prior, choice, readings, sizes, length, shape, left_out, plane)
-    return TrackLearning(
-        refined, fused.shape, fused.model, length, rollouts, document, learning, fused, choice, left_out
-    )
+    return TrackLearning(refined, fused.model, length, rollouts, document, learning, fused, choice, left_out)
 
 
 def _check_frames(tracks: Mapping[int, ObjectTrack], shape: ObjectShape, world_from_camera: Transform) -> None:

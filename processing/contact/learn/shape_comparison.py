@@ -112,15 +112,11 @@ def mean_loss_j(losses: Mapping[int, TossLoss]) -> float:
     return float(np.mean([x.loss_j for x in losses.values()]))
 
 
-def series_of(
-    tracks: Mapping[int, ObjectTrack], world_from_camera: Transform, tracked_only: bool = True
-) -> list[PoseSeries]:
+def series_of(tracks: Mapping[int, ObjectTrack], world_from_camera: Transform) -> list[PoseSeries]:
     """`world_from_object` of tracks, without lost frames; interpolated ones are a guess and are left out too."""
     out = []
     for toss, track in sorted(tracks.items()):
-        kept = np.array(
-            [s == "tracked" or (s == "interpolated" and not tracked_only) for s in track.status], dtype=bool
-        )
+        kept = np.array([s == "tracked" for s in track.status], dtype=bool)
         moved = world_from_camera.matrix @ track.camera_from_object[kept]
         time_s = 1e-9 * (track.time_ns[kept] - track.time_ns[0]) if len(track.time_ns) else np.zeros(0)
         out.append(PoseSeries(toss, time_s, moved[:, :3, :3].copy(), moved[:, :3, 3].copy()))

@@ -1,9 +1,8 @@
 """The pose of a known shape in one frame after the other, each from the frames before it alone.
 
 The frame's foreground near where the object is expected becomes a view (`sensor/view.py`), which is aligned to the
-shape
-drawn from all sides and to the last view by the tracker's own kernels (depth, appearance, silhouette). Two hypotheses
-are carried where the shape looks alike from two sides. What is lost is sought anew over all orientations.
+shape drawn from all sides and to the last view by the tracker's own kernels (depth, appearance, silhouette). Two
+hypotheses are carried where the shape looks alike from two sides. What is lost is sought anew over all orientations.
 """
 
 from __future__ import annotations

@@ -81,11 +81,11 @@ class Memory:
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """The object in one frame. `others_px`: pixels near it that are neither scene nor robot nor the object."""
+    """The object in one frame. `others_near`: something near it is neither scene nor robot nor the object;
+    `largest_other_px`: the pixels of the largest such thing anywhere."""
 
     mask: Bool[Array, "h w"]
     confidence: float
-    others_px: int = 0
     others_near: bool = False
     largest_other_px: int = 0
 
@@ -162,10 +162,8 @@ def follow(
     rough = component_in(moved, near)
     if cues is not None:
         rough |= _other_pieces(frame, moved & ~rough, expected, cues, memory, s)
-    others = moved & near & ~grown(rough, 3)
-    others_px = int(others.sum())
     if rough.sum() < s.least_px:
-        return Found(np.zeros_like(rough), 0.0, others_px, False)
+        return Found(np.zeros_like(rough), 0.0)
     wide = grown(rough, 5)
     unknown = ~scene.known if cues is None else cues.unknown
     if not memory.others_near:  # where nothing else is near, depth before the table suffices
@@ -175,7 +173,7 @@ def follow(
     if strange or (larger and not _is_all_object(frame, rough, expected, memory, far_px, s)):
         rough = _among_others(frame, scene, moved, expected, memory, cues, s)
         if rough.sum() < s.least_px:
-            return Found(np.zeros_like(rough), 0.0, others_px, True)
+            return Found(np.zeros_like(rough), 0.0, others_near=True)
         mask, sure = rough, 0.6
     else:
         least = None if cues is None else s.piece_px
@@ -189,7 +187,7 @@ def follow(
     solid = moved & near & (frame.depth_m > 0)  # what only looks different may be the object's shadow
     others_near = int((solid & ~grown(mask, 3)).sum()) > s.least_px or int((solid & ~mask).sum()) > 3 * s.least_px
     largest = _largest_other(frame, scene, moved & ~grown(mask, 9), s)
-    return Found(mask, float(np.clip(sure * min(1.0, ratio / 0.7), 0, 1)), others_px, others_near, largest)
+    return Found(mask, float(np.clip(sure * min(1.0, ratio / 0.7), 0, 1)), others_near, largest)
 
 
 def _moved_by_depth(

@@ -49,7 +49,7 @@ class CandidateSettings:
 class Candidate:
     """A thing in one frame. `mask` lies within `box` (left, top) of the coarse image; `center_m` is the mean of its
     visible points in the camera frame; `size_m` the root of its visible area; `free` is 1 where nothing touches it, 0
-    where the image's border cuts it; `on_robot`: it touches the drawn robot. `shares`: of its colours."""
+    where the image's border cuts it; `shares`: of its colours."""
 
     position: int
     time_s: float
@@ -58,7 +58,6 @@ class Candidate:
     center_m: Float[Array, "3"]
     size_m: float
     free: float
-    on_robot: bool
     shares: Float[Array, " n"]
 
     @property
@@ -138,28 +137,28 @@ class Finder:
         use &= np.abs(depth - median_m) < 0.3
         center = (self._rays[at][use] * depth[use][:, None]).mean(0).astype(np.float64)
         size = float(np.sqrt(mask.sum())) * self._pixel_m * median_m
-        free, on_robot = self._free(labels, number, at, np.abs(drawn_m - median_m) < self.settings.robot_near_m)
+        free = self._free(labels, number, at, np.abs(drawn_m - median_m) < self.settings.robot_near_m)
         shares = color_shares(
             frame.color_rgb[at], cv2.erode(np.pad(mask, 1).astype(np.uint8), kernel(1))[1:-1, 1:-1] > 0
         )
         shares = shares if shares.any() else color_shares(frame.color_rgb[at], mask)
-        return Candidate(position, frame.time_ns * 1e-9, (left, top), mask, center, size, free, on_robot, shares)
+        return Candidate(position, frame.time_ns * 1e-9, (left, top), mask, center, size, free, shares)
 
     def _free(
         self, labels: Int[Array, "h w"], number: int, at: tuple[slice, slice], robot: Bool[Array, "h w"]
-    ) -> tuple[float, bool]:
-        """How free a thing stands, and whether it touches the robot."""
+    ) -> float:
+        """How free a thing stands."""
+        if at[0].start == 0 or at[1].start == 0 or at[0].stop == labels.shape[0] or at[1].stop == labels.shape[1]:
+            return 0.0
         n = self.settings.near_px
         rows = slice(max(at[0].start - n, 0), at[0].stop + n)
         columns = slice(max(at[1].start - n, 0), at[1].stop + n)
         mine = labels[rows, columns] == number
         around = (cv2.dilate(mine.astype(np.uint8), kernel(n)) > 0) & ~mine
-        if at[0].start == 0 or at[1].start == 0 or at[0].stop == labels.shape[0] or at[1].stop == labels.shape[1]:
-            return 0.0, bool((around & robot[rows, columns]).any())
         rim = max(int(around.sum()), 1)
         touched = (around & (robot[rows, columns] | (labels[rows, columns] > 0))).sum() / rim
         unknown = (around & ~self._scene.known[rows, columns]).sum() / rim
-        return float(np.clip(1 - 4 * touched - unknown, 0.05, 1)), bool((around & robot[rows, columns]).any())
+        return float(np.clip(1 - 4 * touched - unknown, 0.05, 1))
 
 
 def coarser(scene: StaticScene, stride: int) -> StaticScene:

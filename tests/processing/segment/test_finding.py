@@ -43,7 +43,7 @@ NOISE_M = 0.003
 def thing(
     position: int, center_m: np.ndarray, shares: np.ndarray = RED, size_m: float = 0.08, free: float = 1.0
 ) -> Candidate:
-    return Candidate(position, position / 30, (5, 5), np.ones((9, 9), bool), center_m, size_m, free, False, shares)
+    return Candidate(position, position / 30, (5, 5), np.ones((9, 9), bool), center_m, size_m, free, shares)
 
 
 def thrown(at_m: Sequence[float], frames: int = 14, pull: float = 9.81, **appearance: Any) -> list[Candidate]:
