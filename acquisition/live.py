@@ -20,6 +20,7 @@ from acquisition.devices import Image
 from acquisition.operator import Operator
 from acquisition.streaming.recorder import DepthThumbnail
 from acquisition.streaming.side_thread import SideThread
+from recordings.console import has_display
 from recordings.errors import BadInput
 from recordings.live_frames import FrameBoardWriter, LiveFrame, memory_folder
 from recordings.results.live import LineReader, live_folder, read_state
@@ -165,13 +166,6 @@ def newest_frame(recorder: Records) -> LiveFrame | None:
     return LiveFrame(
         color.number, depth_ns + gap_ns, depth_ns, host_ns, color.pixels, depth.pixels, thumbnails[-1].unit_m
     )
-
-
-def has_display() -> bool:
-    """Whether a viewer's window can open here."""
-    if not sys.platform.startswith("linux"):
-        return True
-    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
 def _started(module: str, *arguments: str, log: IO[bytes]) -> subprocess.Popen[bytes]:

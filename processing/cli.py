@@ -364,7 +364,7 @@ def _contact_only(args: argparse.Namespace, session: Session, out: Path) -> Outc
 
 
 def _out_folder(args: argparse.Namespace, session: Session, several: bool) -> Path:
-    """DESIGN section 4: --out DIR is itself the results folder; by default SESSION/results, of one file beside it."""
+    """--out DIR is itself the results folder; by default SESSION/results, of one file beside it."""
     if args.out is not None:
         return args.out / session.path.resolve().stem if several else args.out
     path = session.path

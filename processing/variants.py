@@ -18,7 +18,7 @@ TRACKERS = ("multi-hypothesis", "frame-to-model")
 
 @dataclass(frozen=True)
 class Variant:
-    """One row: where its poses and its shape come from, and what is done with them (DESIGN section 6).
+    """One row: where its poses and its shape come from, and what is done with them.
 
     `first`: whether the first pass's shape is of one toss or of all together. `refined`: nothing more, contact
     learning alone, one pass of the cycle, passes until nothing changes, or all in one objective. `paper` holds the

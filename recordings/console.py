@@ -8,7 +8,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.set_defaults(work=_work)           # _work(args) -> Outcome, imports what is heavy when called
     return run_command(parser, argv)
 ```
-Exit codes (DESIGN section 4): 0 done; 1 done, but a check fell short; 2 bad input or usage; 130 interrupted.
+Exit codes: 0 done; 1 done, but a check fell short; 2 bad input or usage; 130 interrupted.
 """
 
 from __future__ import annotations
@@ -158,6 +158,13 @@ def without_library_warnings() -> Iterator[None]:
         if not sys.warnoptions:
             warnings.simplefilter("ignore")
         yield
+
+
+def has_display() -> bool:
+    """Whether a viewer's window can open here."""
+    if not sys.platform.startswith("linux"):
+        return True
+    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
 def json_text(document: Mapping[str, Any]) -> str:

@@ -285,8 +285,9 @@ def lab_toml(wrong: dict[str, Any]) -> str:
 
 def bench_times(part: str) -> bool:
     """A toss of each lab, recorded, calibrated by its own motion, compared with the simulation's exposures."""
+    from synthetic.stamp_errors import stamp_errors_ms
+
     from acquisition.cli import main as toss_record
-    from acquisition.synthetic.truth_sidecar import stamp_errors_ms
     from calibration.cli import main as toss_calibrate
 
     good = True

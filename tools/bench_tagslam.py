@@ -1,4 +1,4 @@
-"""TagSLAM's own tests and the session truth against the figures of issue 9. CPU seconds, never wall.
+"""TagSLAM's own tests and the session truth against the figures asked of them. CPU seconds, never wall.
 
 python tools/bench_tagslam.py                         # TagSLAM's tests in the shared data
 python tools/bench_tagslam.py --only 01 16 20

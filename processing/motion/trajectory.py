@@ -82,8 +82,7 @@ class PoseSeries:
         if not good.all():
             raise BadInput(
                 f"toss {toss}: the pose of frame {int(np.argmin(good))} ({int((~good).sum())} of {len(good)}) is NaN "
-                "or "
-                "has a zero quaternion; wanted finite poses, leave lost frames out"
+                "or has a zero quaternion; wanted finite poses, leave lost frames out"
             )
         rotation = Rotation.from_quat(q[:, [1, 2, 3, 0]]).as_matrix()
         times = step_s * np.arange(len(q))

@@ -1,4 +1,4 @@
-"""`export folder`: a session as DESIGN's folder layout, the inverse of `import folder`.
+"""`export folder`: a session as the folder layout, the inverse of `import folder`.
 
 Images keep their bytes, depth its numbers, times their nanoseconds: what the layout counts from is taken off again.
 """

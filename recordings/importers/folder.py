@@ -1,4 +1,4 @@
-"""`toss-session import folder`: DESIGN's folder layout into a session (that of `cube_dev` and `lab_dev`).
+"""`toss-session import folder`: the folder layout into a session (that of `cube_dev` and `lab_dev`).
 
 Each toss of the layout has its own clock starting at 0. On the session clock toss k starts at `clock_offset_ns` of its
 file's info, so that the clock grows over the session; `export folder` takes the offset off again.

@@ -1,6 +1,6 @@
 """Records to MCAP messages and back: Foxglove's protobuf schemas where one exists, tosslab's own where none does.
 
-The topics are those of DESIGN's contract. `compress` of a topic says whether its chunk gains from zstd.
+The topics are listed in ARCHITECTURE.md. `compress` of a topic says whether its chunk gains from zstd.
 """
 
 from __future__ import annotations

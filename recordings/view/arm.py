@@ -8,11 +8,11 @@ from jaxtyping import Int64
 from numpy import ndarray as Array
 
 from recordings.errors import BadInput
-from recordings.geometry import Transform, quaternion_from_rotation
+from recordings.geometry import Transform
 from recordings.records import ArmStates
 from recordings.robot.arm import LinkMesh, Robot, panda
 from recordings.robot.collada import read_collada
-from recordings.view.layers import Clock
+from recordings.view.layers import Clock, quaternions_xyzw
 from recordings.view.mesh import flat_mesh
 from recordings.view.scene import Scene
 
@@ -41,10 +41,8 @@ def log_arm_motion(recording: rr.RecordingStream, scene: Scene, robot: Robot, to
     root_from_link = [links_at(robot, states, int(i), root_from_base) for i in samples]
     for link in {mesh.link for mesh in robot.meshes}:
         places = [links[link] for links in root_from_link]
-        wxyz = np.array([quaternion_from_rotation(p.rotation) for p in places])
-        columns = rr.Transform3D.columns(
-            translation=[p.translation_m for p in places], quaternion=wxyz[:, [1, 2, 3, 0]]
-        )
+        turned = quaternions_xyzw(np.array([p.rotation for p in places]))
+        columns = rr.Transform3D.columns(translation=[p.translation_m for p in places], quaternion=turned)
         clock.columns(f"{ROBOT}/{link}", states.time_ns[samples], columns)
 
 

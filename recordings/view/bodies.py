@@ -9,10 +9,10 @@ import rerun as rr
 from jaxtyping import Float, Int64
 from numpy import ndarray as Array
 
-from recordings.geometry import CameraModel, Transform, quaternion_from_rotation, rotation_angle_rad
+from recordings.geometry import CameraModel, Transform, rotation_angle_rad
 from recordings.tracks import TagPlacement, runs
 from recordings.view.body_point import at_same_point
-from recordings.view.layers import CAMERA, MOTION, Clock, Look, image_entity, plotted
+from recordings.view.layers import CAMERA, MOTION, Clock, Look, image_entity, plotted, quaternions_xyzw
 from recordings.view.mesh import outline_px, shaded_mesh
 from recordings.view.scene import Body, Color, Scene, root_poses
 
@@ -111,8 +111,8 @@ def log_poses(
         if after < len(known):
             clock.at(int(times_ns[after])).log(entity, rr.Clear(recursive=True))
     if known.any():
-        wxyz = np.array([quaternion_from_rotation(m[:3, :3]) for m in matrices[known]])
-        columns = rr.Transform3D.columns(translation=matrices[known, :3, 3], quaternion=wxyz[:, [1, 2, 3, 0]])
+        turned = quaternions_xyzw(matrices[known, :3, :3])
+        columns = rr.Transform3D.columns(translation=matrices[known, :3, 3], quaternion=turned)
         clock.columns(entity, times_ns[known], columns)
 
 

@@ -15,12 +15,11 @@ from jaxtyping import Bool, Float, Int64, UInt8
 from numpy import ndarray as Array
 from scipy.spatial import cKDTree
 
-from recordings.geometry import quaternion_from_rotation
 from recordings.tracks import ObjectShape, ObjectTrack
 from recordings.view.bodies import unbroken
 from recordings.view.cycle_steps import Judged, Laid, Rollout, Step, TossCycle
-from recordings.view.layers import EVENTS, Clock, plotted
-from recordings.view.mesh import shaded_mesh, vertex_normals
+from recordings.view.layers import EVENTS, Clock, plotted, quaternions_xyzw
+from recordings.view.mesh import shaded_mesh, smooth_mesh, vertex_normals
 from recordings.view.scene import Body, Color, Scene
 
 PASS, GHOST, STEPS = "world/passes/{}/{}", "world/ghost/{}", "steps/{}"
@@ -121,12 +120,7 @@ def log_shapes(clock: Clock, scene: Scene, body: Body, start_ns: int) -> None:
 def compared_mesh(shape: ObjectShape, first: ObjectShape) -> rr.Mesh3D:
     """A shape coloured by where it lies outside (red) or inside (blue) of the first one; that one is grey."""
     gap = np.zeros(len(shape.vertices_m)) if shape is first else gap_m(shape, first)
-    return rr.Mesh3D(
-        vertex_positions=shape.vertices_m.astype(np.float32),
-        triangle_indices=shape.faces.astype(np.uint32),
-        vertex_normals=vertex_normals(shape.vertices_m, shape.faces).astype(np.float32),
-        vertex_colors=gap_colors(gap),
-    )
+    return smooth_mesh(shape, vertex_colors=gap_colors(gap))
 
 
 def gap_m(shape: ObjectShape, first: ObjectShape) -> Float[Array, " v"]:
@@ -165,12 +159,12 @@ def move(clock: Clock, entity: str, start_ns: int, times_ns: Int64[Array, " n"],
         return
     known = np.isfinite(poses).all(axis=(1, 2))
     placed = np.where(known[:, None, None], poses, np.eye(4))
-    wxyz = np.array([quaternion_from_rotation(m[:3, :3]) for m in placed])
+    turned = quaternions_xyzw(placed[:, :3, :3])
     size = np.where(known, 1.0, NOWHERE)
     if times_ns[0] > start_ns:
         clock.at(start_ns).log(entity, rr.Transform3D(translation=[0, 0, 0], scale=NOWHERE))
     columns = rr.Transform3D.columns(
-        translation=placed[:, :3, 3], quaternion=wxyz[:, [1, 2, 3, 0]], scale=np.repeat(size[:, None], 3, axis=1)
+        translation=placed[:, :3, 3], quaternion=turned, scale=np.repeat(size[:, None], 3, axis=1)
     )
     clock.columns(entity, times_ns, columns)
 

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import contextlib
-import os
-import sys
 import uuid
 from dataclasses import dataclass
 from pathlib import Path
 
 import rerun as rr
 
+from recordings.console import has_display
 from recordings.errors import BadInput, WriteFailed
 from recordings.mcap.file import McapFile
 from recordings.progress import Progress, Silent
@@ -130,7 +129,7 @@ def _viewed(path: Path, scene: Scene | None, look: Look, size: tuple[int, int]) 
 def open_viewer(path: Path, choice: Choice = Choice(), look: Look = LOOK, progress: Progress = SILENT) -> None:
     """Open the viewer's window and stay until it is closed. Raises ViewerFailed where there is no display."""
     scene = None if is_foreign(path) else open_scene(path, choice)
-    if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+    if not has_display():
         raise ViewerFailed(
             "there is no display here for the viewer's window; "
             f"write a file with `toss-view {path} --save out.rrd` and open it where there is one with `rerun out.rrd`, "

@@ -10,7 +10,7 @@ from jaxtyping import Float, Float32, Int64, UInt8
 from numpy import ndarray as Array
 
 from recordings.errors import BadInput, DamagedFile
-from recordings.geometry import CameraModel, Transform
+from recordings.geometry import CameraModel, Transform, quaternion_from_rotation
 from recordings.mcap.codec import decode_image
 from recordings.progress import Progress
 from recordings.records import DepthImage, EncodedImage, HealthLine, RgbdFrame
@@ -184,6 +184,11 @@ class Thinned:
         points, colors = self.points(frame, look.cloud_reach_m)
         radii = 0.5 * look.cloud_fill * self.spread * points[:, 2]
         return rr.Points3D(short(root_from_camera.points(points)), colors=colors, radii=short(radii))
+
+
+def quaternions_xyzw(rotations: Float[Array, "n 3 3"]) -> Float[Array, "n 4"]:
+    """As rerun has them."""
+    return np.array([quaternion_from_rotation(R) for R in rotations]).reshape(-1, 4)[:, [1, 2, 3, 0]]
 
 
 def short(values: Float[Array, "*n"]) -> Float32[Array, "*n"]:

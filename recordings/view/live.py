@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import sys
 import uuid
 from types import TracebackType
 
@@ -11,6 +9,7 @@ import rerun as rr
 from jaxtyping import UInt8, UInt16
 from numpy import ndarray as Array
 
+from recordings.console import has_display
 from recordings.view.viewer import Viewer, ViewerFailed
 
 APPLICATION = "toss-record"
@@ -22,12 +21,11 @@ class LiveView:
     """A viewer that is fed while something is recorded. Raises ViewerFailed where there is no display."""
 
     def __init__(self, headless: bool = False) -> None:
-        if not headless and sys.platform.startswith("linux"):
-            if not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-                raise ViewerFailed(
-                    "there is no display here for --preview; leave it out, or run where there is one. What was "
-                    "recorded can be looked at with `toss-view SESSION --save out.rrd`"
-                )
+        if not headless and not has_display():
+            raise ViewerFailed(
+                "there is no display here for --preview; leave it out, or run where there is one. What was recorded "
+                "can be looked at with `toss-view SESSION --save out.rrd`"
+            )
         self._viewer = Viewer(headless=headless)
         self._recording = rr.RecordingStream(APPLICATION, recording_id=uuid.uuid4())
 

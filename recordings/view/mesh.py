@@ -24,11 +24,16 @@ def shaded_mesh(shape: ObjectShape, rgba: tuple[int, int, int, int]) -> rr.Mesh3
     """A shape in one colour: with sharp edges where it has few faces, smooth where it has many."""
     if len(shape.faces) <= FEW_FACES:
         return flat_mesh(shape.vertices_m, shape.faces, albedo_factor=rgba)
+    return smooth_mesh(shape, albedo_factor=rgba)
+
+
+def smooth_mesh(shape: ObjectShape, **look: Any) -> rr.Mesh3D:
+    """Faces that share their corners, shaded by the normals there."""
     return rr.Mesh3D(
         vertex_positions=shape.vertices_m.astype(np.float32),
         triangle_indices=shape.faces.astype(np.uint32),
         vertex_normals=vertex_normals(shape.vertices_m, shape.faces).astype(np.float32),
-        albedo_factor=rgba,
+        **look,
     )
 
 

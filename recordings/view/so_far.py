@@ -10,7 +10,7 @@ from __future__ import annotations
 import contextlib
 import time
 import uuid
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -27,7 +27,7 @@ from recordings.results.live import TossSoFar, newest_lines, read_state, read_to
 from recordings.results.shape_file import read_shape
 from recordings.session import Session
 from recordings.tracks import ObjectShape, RigCalibration
-from recordings.view.mesh import outline_px, vertex_normals
+from recordings.view.mesh import outline_px, smooth_mesh
 from recordings.view.viewer import Viewer
 
 APPLICATION = "toss-view --live"
@@ -147,7 +147,7 @@ class SessionView:
         )
 
 
-def show_live(session: Path, screenshot: Path | None = None, waited: Callable[[], None] | None = None) -> Path | None:
+def show_live(session: Path, screenshot: Path | None = None) -> Path | None:
     """The viewer until its window is closed, or one picture of what is known now. Raises BadInput, ViewerFailed."""
     from recordings.whole_file import write_bytes
 
@@ -179,12 +179,7 @@ def shape_so_far(shape: ObjectShape) -> rr.Mesh3D:
     """The mesh, what no view saw in red."""
     observed = np.ones(len(shape.vertices_m), dtype=bool) if shape.observed is None else shape.observed
     colors = np.where(observed[:, None], SEEN, UNSEEN).astype(np.uint8)
-    return rr.Mesh3D(
-        vertex_positions=shape.vertices_m.astype(np.float32),
-        triangle_indices=shape.faces.astype(np.uint32),
-        vertex_normals=vertex_normals(shape.vertices_m, shape.faces).astype(np.float32),
-        vertex_colors=colors,
-    )
+    return smooth_mesh(shape, vertex_colors=colors)
 
 
 def outlined(

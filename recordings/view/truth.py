@@ -15,8 +15,7 @@ from numpy import ndarray as Array
 from recordings.bounded.documents import read_json
 from recordings.bounded.limits import open_npz
 from recordings.errors import DamagedFile
-from recordings.geometry import quaternion_from_rotation
-from recordings.view.layers import Clock, image_entity
+from recordings.view.layers import Clock, image_entity, quaternions_xyzw
 from recordings.view.scene import Scene
 
 SEEN_COLOR, LEFT_COLOR, SIGMA_COLOR = (70, 230, 120), (255, 70, 70), (255, 160, 40)
@@ -91,11 +90,10 @@ def ellipsoids(poses: Float[Array, "n 4 4"], covariances: Float[Array, "n 6 6"])
     values, vectors = np.linalg.eigh(covariances[:, 3:, 3:])
     turns = poses[:, :3, :3] @ vectors
     turns[np.linalg.det(turns) < 0, :, 0] *= -1
-    wxyz = np.array([quaternion_from_rotation(R) for R in turns]).reshape(-1, 4)
     return rr.Ellipsoids3D(
         centers=poses[:, :3, 3],
         half_sizes=SIGMAS * np.sqrt(np.maximum(values, 0.0)),
-        quaternions=wxyz[:, [1, 2, 3, 0]],
+        quaternions=quaternions_xyzw(turns),
         colors=[SIGMA_COLOR],
         line_radii=-0.7,
     )

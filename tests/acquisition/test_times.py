@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from synthetic.stamp_errors import stamp_errors_ms
 
 from acquisition.cli import main as toss_record
-from acquisition.synthetic.truth_sidecar import stamp_errors_ms
 from calibration.cli import main as toss_calibrate
 
 RIG = """name = "times"

@@ -1,6 +1,6 @@
 """What a session is, drawn whole from its seed: object, camera, light, scene, errors of calibration, physics.
 
-The ranges are those of issue 20, none of them fitted to a recording. `Spec` is plain data, written beside the truth.
+The ranges were set beforehand, none of them fitted to a recording. `Spec` is plain data, written beside the truth.
 """
 
 from __future__ import annotations

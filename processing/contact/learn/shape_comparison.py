@@ -17,7 +17,6 @@ from numpy import ndarray as Array
 from processing.contact.learn.data_checks import lowest_point_m
 from processing.contact.learn.prepared import Prepared, prepare, transitions
 from processing.contact.learn.prior import Frame
-from processing.contact.physics.inertia import Physics
 from processing.contact.physics.loss import (
     REFERENCE_MASS_KG,
     Body,
@@ -121,25 +120,6 @@ def series_of(tracks: Mapping[int, ObjectTrack], world_from_camera: Transform) -
         time_s = 1e-9 * (track.time_ns[kept] - track.time_ns[0]) if len(track.time_ns) else np.zeros(0)
         out.append(PoseSeries(toss, time_s, moved[:, :3, :3].copy(), moved[:, :3, 3].copy()))
     return out
-
-
-def uniform_model(shape: ObjectShape, physics: Physics, friction: float, plane: Plane) -> ContactModel:
-    """A model that nothing was learned for: a shape's hull with a friction, to compare others with."""
-    points = trimmed_hull(shape.vertices_m, shape.faces)
-    return ContactModel(
-        object_frame=shape.object_frame,
-        support_vertices_m=points,
-        pieces=(tuple(range(len(points))),),
-        friction=friction,
-        friction_low=0.0,
-        friction_high=1.0,
-        mass_kg=physics.mass_kg,
-        inertia_kgm2=physics.inertia_kgm2,
-        center_of_mass_m=physics.center_of_mass_m,
-        physics_source=physics.source,
-        plane_normal_world=plane.normal_world,
-        plane_offset_m=plane.offset_m,
-    )
 
 
 def usable(tracks: Sequence[ObjectTrack], least: float) -> dict[int, str]:

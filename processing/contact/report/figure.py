@@ -45,13 +45,13 @@ def draw_result(
     figure.savefig(path)
 
 
-def draw_errors(left: Any, right: Any, done: Evaluation, unlearned: tuple[int, ...], against: str = "") -> None:
+def draw_errors(left: Any, right: Any, done: Evaluation, unlearned: tuple[int, ...]) -> None:
     """Position (left axes) and rotation errors of rollouts against time; tosses not learned from are marked."""
     time_ms = 1e3 * done.errors.step_s * np.arange(1, done.errors.position_m.shape[1] + 1)
     marked = np.isin(done.errors.tosses, unlearned)
-    _errors(left, time_ms, 1e3 * done.errors.position_m, done.position, 1e3, marked, "mm", against)
+    _errors(left, time_ms, 1e3 * done.errors.position_m, done.position, 1e3, marked, "mm")
     degrees = np.degrees(done.errors.rotation_rad)
-    _errors(right, time_ms, degrees, done.rotation, 180 / np.pi, marked, "deg", against)
+    _errors(right, time_ms, degrees, done.rotation, 180 / np.pi, marked, "deg")
 
 
 def _plain(axes: Any) -> None:
@@ -68,7 +68,6 @@ def _errors(
     unit: float,
     marked: Any,
     name: str,
-    against: str = "",
 ) -> None:
     both = bool(marked.any() and not marked.all())
     for row, special in zip(errors, marked):
@@ -88,7 +87,7 @@ def _errors(
     late = errors[:, reached - max(reached // 4, 1) : reached]
     top = max(float(np.nanpercentile(late, 97)), float(np.nanmax(unit * summary.curve_high)))
     axes.set(xlim=(0, time_ms[reached - 1]), ylim=(0, 1.05 * top), xlabel="time since the start of the rollout, ms")
-    what = ("position error, mm" if name == "mm" else "rotation error, deg") + (f" {against}" if against else "")
+    what = "position error, mm" if name == "mm" else "rotation error, deg"
     axes.set_title(
         f"{what}: mean {unit * summary.mean:.1f} ({unit * summary.low:.1f} .. {unit * summary.high:.1f})",
         fontsize=10,

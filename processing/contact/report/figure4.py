@@ -60,7 +60,7 @@ def learn_figure_4(
     progress: Progress | None = None,
     step_s: float = STEP_S,
 ) -> tuple[Figure4, TrackLearning]:
-    """Learn on the estimated tracks of all tosses but the last (DESIGN section 6), and roll all of them out.
+    """Learn on the estimated tracks of all tosses but the last, and roll all of them out.
 
     Raises BadInput for fewer than two usable tosses.
     """

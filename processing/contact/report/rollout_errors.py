@@ -112,56 +112,33 @@ def evaluate(
     steps: int = 80,
     step_s: float = 1 / 148,
     begin: Literal["first", "thrown", "release"] = "first",
-    against: Sequence[PoseSeries] | None = None,
     ready: Prepared | None = None,
 ) -> Evaluation:
-    """Roll the learned model out from each toss's first frame (or its release) and compare with its track.
+    """Roll the learned model out from each toss's first frame (or its release), for steps of step_s or for finer ones
+    where it has a law of contact, and compare with its track.
 
     `thrown`: from the first frame, unless a hand holds the object for HELD_S or longer: then from the release.
-    `against`: other poses of the same tosses and the same body (ground truth) to compare with instead. `ready`: the
-    tracks as they were prepared before.
+    `ready`: the tracks as they were prepared before.
     """
     prepared = prepared_for(learning, tracks, plane or Plane()) if ready is None else ready
     first = None if begin == "release" else [0 if begin == "first" else _thrown(s) for s in prepared.smoothed]
     fine_s = step_s if learning.law is None else step_s / fine_steps(step_s)
     start, frames = starts(prepared, fine_s, learning.fitted.inertia_start_kgm2, first)
-    return evaluate_from(learning, prepared, start, frames, steps, step_s, against, plane or Plane())
+    body, contacts = learning.body(), learning.fitted.geometry.contacts
+    if learning.law is None:
+        rolled = simulate(body, contacts, start, steps, step_s)
+    else:
+        rolled = simulate_law(body, contacts, learning.law, start, steps, step_s)
+    errors = rollout_errors(rolled, prepared.tracks, list(frames), step_s)
+    begun = tuple(float(t.time_s[b]) for t, b in zip(prepared.tracks, frames))
+    position, rotation = summarise(errors.position_m), summarise(errors.rotation_rad)
+    return Evaluation(errors, position, rotation, dict(prepared.left_out), rolled, start, begun)
 
 
 def _thrown(smoothed: Smoothed) -> int:
     release = smoothed.phases.release or 0
     held_s = float(smoothed.states.time_s[release] - smoothed.states.time_s[0])
     return release if held_s >= HELD_S else 0
-
-
-def evaluate_from(
-    learning: ContactLearning,
-    prepared: Prepared,
-    start: Start,
-    first: Sequence[int],
-    steps: int,
-    step_s: float,
-    against: Sequence[PoseSeries] | None,
-    plane: Plane,
-) -> Evaluation:
-    """Roll out from given states (for steps of step_s, or for finer ones where the model has a law of contact)."""
-    body, contacts = learning.body(), learning.fitted.geometry.contacts
-    if learning.law is None:
-        rolled = simulate(body, contacts, start, steps, step_s)
-    else:
-        rolled = simulate_law(body, contacts, learning.law, start, steps, step_s)
-    tracks: Sequence[PoseSeries] = prepared.tracks
-    begin = list(first)
-    if against is not None:
-        level = plane.level_from_world()
-        moved = {t.toss: learning.frame.of(t).turned(level, plane.offset_m) for t in against}
-        times = [t.time_s[b] for t, b in zip(tracks, begin)]
-        tracks = [moved[t.toss] for t in tracks]
-        begin = [int(np.abs(t.time_s - at).argmin()) for t, at in zip(tracks, times)]
-    errors = rollout_errors(rolled, tracks, begin, step_s)
-    begun = tuple(float(t.time_s[b]) for t, b in zip(prepared.tracks, first))
-    position, rotation = summarise(errors.position_m), summarise(errors.rotation_rad)
-    return Evaluation(errors, position, rotation, dict(prepared.left_out), rolled, start, begun)
 
 
 def world_poses(learning: ContactLearning, done: Evaluation, plane: Plane) -> dict[int, Float[Array, "t 4 4"]]:

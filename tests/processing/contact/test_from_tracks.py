@@ -11,7 +11,7 @@ from processing.contact.learn.data_checks import Contradiction
 from processing.contact.learn.fit import FitConfig
 from processing.contact.learn.from_tracks import TracksConfig, learn_from_tracks
 from processing.contact.learn.learn import ContactConfig
-from processing.contact.learn.shape_comparison import contact_loss_of, mean_loss_j, uniform_model
+from processing.contact.learn.shape_comparison import contact_loss_of, mean_loss_j
 from processing.contact.physics.inertia import uniform_physics
 from processing.contact.physics.loss import Weights
 from processing.contact.physics.plane import Plane, calibrated_plane
@@ -22,7 +22,7 @@ from processing.evaluate.metrics import rollout_errors
 from processing.motion.trajectory import PoseSeries, rotation_matrices
 from recordings.errors import BadInput
 from recordings.geometry import Transform
-from recordings.tracks import ObjectShape, ObjectTrack, RigCalibration
+from recordings.tracks import ContactModel, ObjectShape, ObjectTrack, RigCalibration
 
 EDGES_M = np.array([0.1, 0.08, 0.06])
 WORLD_FROM_CAMERA = Transform(
@@ -168,6 +168,25 @@ def test_spikes_below_the_table_do_not_keep_contact_out(simulated_tosses):
     sunk = Transform("world", "d455", WORLD_FROM_CAMERA.rotation, WORLD_FROM_CAMERA.translation_m - [0, 0, 0.009])
     with pytest.raises(BadInput, match=r"\d mm below the plane"):
         learn_from_tracks(tracks_of(series), spiky, sunk, config=QUICK)
+
+
+def uniform_model(shape, physics, friction, plane):
+    """A model that nothing was learned for: a shape's hull with a friction, to compare others with."""
+    points = trimmed_hull(shape.vertices_m, shape.faces)
+    return ContactModel(
+        object_frame=shape.object_frame,
+        support_vertices_m=points,
+        pieces=(tuple(range(len(points))),),
+        friction=friction,
+        friction_low=0.0,
+        friction_high=1.0,
+        mass_kg=physics.mass_kg,
+        inertia_kgm2=physics.inertia_kgm2,
+        center_of_mass_m=physics.center_of_mass_m,
+        physics_source=physics.source,
+        plane_normal_world=plane.normal_world,
+        plane_offset_m=plane.offset_m,
+    )
 
 
 def test_the_contact_loss_tells_a_wrong_shape_and_wrong_poses(simulated_tosses):
