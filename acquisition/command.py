@@ -6,7 +6,6 @@ import argparse
 import contextlib
 import datetime
 import platform
-import shutil
 import sys
 import time
 from collections.abc import Mapping
@@ -16,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from acquisition.arm.throw import Thrower
+from acquisition.disk import free_bytes
 from acquisition.interrupts import Interrupts
 from acquisition.live import LiveSession, require_follower
 from acquisition.operator import Keyboard, Nobody, Operator, Unattended, single_keys
@@ -234,10 +234,7 @@ def _go_on(checks: Preflight, operator: Operator) -> None:
 
 def check_room(out: Path, reserve_gb: float) -> None:
     """Raises BadInput for a disk that is full before anything is opened."""
-    place = out
-    while not place.exists():
-        place = place.parent
-    free = shutil.disk_usage(place).free
+    place, free = free_bytes(out)
     if free < reserve_gb * 1e9:
         raise BadInput(
             f"{place} has {free / 1e9:.2f} GB free, less than the reserve of {reserve_gb:g} GB; nothing was written. "

@@ -17,6 +17,14 @@ JPEG_SHARE, LOSSLESS_SHARE, DEPTH_SHARE = 0.25, 0.75, 0.4
 ARM_BYTES_S = 400_000
 
 
+def free_bytes(folder: Path) -> tuple[Path, int]:
+    """The nearest folder above that exists, and the bytes that are free there."""
+    place = folder
+    while not place.exists():
+        place = place.parent
+    return place, shutil.disk_usage(place).free
+
+
 def expected_bytes_s(recorder: Recorder) -> float:
     """Bytes per second on the disk, from the pictures that flow."""
     total = 0.0
@@ -35,10 +43,7 @@ def expected_bytes_s(recorder: Recorder) -> float:
 
 def check_disk(folder: Path, bytes_s: float, longest_s: float, reserve_gb: float) -> None:
     """Raises DiskFull unless twice the longest toss and the reserve fit."""
-    place = folder
-    while not place.exists():
-        place = place.parent
-    free, wanted = shutil.disk_usage(place).free, 2 * bytes_s * longest_s + reserve_gb * 1e9
+    (place, free), wanted = free_bytes(folder), 2 * bytes_s * longest_s + reserve_gb * 1e9
     if free < wanted:
         raise DiskFull(
             f"{place} has {free / 1e9:.2f} GB free; a toss of {longest_s:g} s at {bytes_s / 1e6:.0f} MB/s and the "

@@ -5,10 +5,10 @@ from __future__ import annotations
 import importlib.util
 import os
 import resource
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
+from acquisition.disk import free_bytes
 from acquisition.drivers import usb
 from acquisition.preflight import Preflight, Row
 from acquisition.streaming.streams import READS
@@ -110,10 +110,7 @@ def priority() -> Row:
 
 
 def room(folder: Path) -> Iterator[Row]:
-    place = folder.resolve()
-    while not place.exists():
-        place = place.parent
-    free = shutil.disk_usage(place).free
+    place, free = free_bytes(folder.resolve())
     yield Row("disk", str(place), "ok" if free > 20e9 else "warning", f"{free / 1e9:.1f} GB free", "20 GB or more")
 
 
@@ -121,10 +118,7 @@ def speed(folder: Path) -> Iterator[Row]:
     """Writes 128 MB and removes them."""
     import time
 
-    place = folder.resolve()
-    while not place.exists():
-        place = place.parent
-    probe = place / f".toss-record-speed-{os.getpid()}"
+    probe = free_bytes(folder.resolve())[0] / f".toss-record-speed-{os.getpid()}"
     block = os.urandom(1 << 22)
     try:
         begun = time.monotonic()

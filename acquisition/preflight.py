@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -15,7 +14,7 @@ from jaxtyping import Float
 from numpy import ndarray as Array
 
 from acquisition.devices import Image, RgbdCamera
-from acquisition.disk import expected_bytes_s
+from acquisition.disk import expected_bytes_s, free_bytes
 from acquisition.streaming.recorder import Recorder
 from acquisition.streaming.streams import Tally
 from recordings.tracks import RigCalibration
@@ -197,10 +196,7 @@ def dots(recorder: Recorder) -> Iterator[Row]:
 def _grain(recorder: Recorder) -> dict[str, float]:
     """Fine contrast of each stream: the median over tiles of the Laplacian's deviation."""
     found = {}
-    for topic, image in list(recorder.latest.items()):
-        if topic.endswith("depth") or "infrared" in topic:
-            continue
-        grey = image.pixels if image.pixels.ndim == 2 else cv2.cvtColor(image.pixels, cv2.COLOR_RGB2GRAY)
+    for topic, grey in greys_of(recorder).items():
         fine = cv2.Laplacian(grey, cv2.CV_32F)
         height, width = (s // 8 * 8 for s in fine.shape)
         tiles = fine[:height, :width].reshape(8, height // 8, 8, width // 8).std(axis=(1, 3))
@@ -221,9 +217,7 @@ def tags(recorder: Recorder, calibration: RigCalibration) -> Iterator[Row]:
         mine = [t for t in found if t.tag_id in table]
         state: State = "ok" if found else "warning"
         yield Row("tags", name, state, f"{len(found)} seen, {len(mine)} of the table", "light, focus, tags in view")
-        off_px = [
-            *_off_px(calibration, name, {t.tag_id: t.corners_px for t in mine}),
-        ]
+        off_px = list(_off_px(calibration, name, {t.tag_id: t.corners_px for t in mine}))
         if off_px:
             drift = float(np.median(off_px))
             state = "ok" if drift < DRIFT_PX else "warning" if drift < DRIFT_BAD_PX else "fail"
@@ -298,11 +292,8 @@ def clocks(recorder: Recorder) -> Iterator[Row]:
 def disk(recorder: Recorder, folder: Path) -> Row:
     """Room for the next toss, twice, and the reserve."""
     config = recorder.rig.recording
-    place = folder
-    while not place.exists():
-        place = place.parent
-    bytes_s = expected_bytes_s(recorder)
-    free, wanted = shutil.disk_usage(place).free, 2 * bytes_s * config.longest_toss_s + config.reserve_gb * 1e9
+    (place, free), bytes_s = free_bytes(folder), expected_bytes_s(recorder)
+    wanted = 2 * bytes_s * config.longest_toss_s + config.reserve_gb * 1e9
     found = f"{free / 1e9:.1f} GB free, {bytes_s / 1e6:.0f} MB/s while recording"
     return Row(
         "disk", str(place), "ok" if free >= wanted else "fail", found, f"{wanted / 1e9:.1f} GB for the next toss"
