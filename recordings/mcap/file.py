@@ -62,6 +62,17 @@ class Message:
     data: bytes
 
 
+def open_unbuffered(path: Path) -> tuple[io.FileIO, int]:
+    """A file to read at any place, and its size in bytes. Raises BadInput where it cannot be opened."""
+    try:
+        file = open(path, "rb", buffering=0)  # noqa: SIM115 (whoever asked closes it)
+        return file, os.fstat(file.fileno()).st_size
+    except IsADirectoryError as folder:
+        raise BadInput(f"{path} is a folder; wanted an .mcap file") from folder
+    except OSError as refused:
+        raise BadInput(f"{path} cannot be opened: {refused.strerror}") from refused
+
+
 class McapFile:
     """An MCAP file with an index. Raises BadInput when it is none, DamagedFile when it was cut off or altered.
 
@@ -70,13 +81,7 @@ class McapFile:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        try:
-            self._file = open(path, "rb", buffering=0)  # noqa: SIM115
-            self.size = os.fstat(self._file.fileno()).st_size
-        except IsADirectoryError as folder:
-            raise BadInput(f"{path} is a folder; wanted an .mcap file") from folder
-        except OSError as refused:
-            raise BadInput(f"{path} cannot be opened: {refused.strerror}") from refused
+        self._file, self.size = open_unbuffered(path)
         self._guard(self._check_ends, "its beginning or end")
         self.summary: Summary = self._guard(self._read_summary, "its index")
         self._lock = threading.Lock()

@@ -21,7 +21,7 @@ from mcap.records import Attachment, Channel, McapRecord, Metadata, Schema
 
 from recordings.bounded.limits import MOST_CHUNK_BYTES, SEARCHED_TIMES, Budget, unpack
 from recordings.errors import BadInput
-from recordings.mcap.file import RAISED
+from recordings.mcap.file import RAISED, open_unbuffered
 
 HEAD = struct.Struct("<BQ")
 MESSAGE = struct.Struct("<HIQQ")
@@ -48,13 +48,7 @@ class Bytes:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.searched = 0
-        try:
-            self._file = open(path, "rb", buffering=0)  # noqa: SIM115
-            self.size = os.fstat(self._file.fileno()).st_size
-        except IsADirectoryError as folder:
-            raise BadInput(f"{path} is a folder; wanted an .mcap file") from folder
-        except OSError as refused:
-            raise BadInput(f"{path} cannot be opened: {refused.strerror}") from refused
+        self._file, self.size = open_unbuffered(path)
 
     def __enter__(self) -> Bytes:
         return self

@@ -46,7 +46,6 @@ class Finding:
 class TopicSeen:
     """What the data section holds of one topic, in the order of the file."""
 
-    schema: str
     bytes: int = 0
     log_ns: list[int] = field(default_factory=list)
     publish_ns: list[int] = field(default_factory=list)
@@ -67,7 +66,6 @@ class Structure:
     topics: dict[str, TopicSeen] = field(default_factory=dict)
     metadata: list[Metadata] = field(default_factory=list)
     attachments: dict[str, int] = field(default_factory=dict)
-    chunks: int = 0
 
     @property
     def damaged(self) -> bool:
@@ -185,7 +183,6 @@ class _Pass:
     def _chunk(self, record: Record) -> None:
         try:
             chunk = mcap_scan.parse_chunk(record, self.budget)
-            self.seen.chunks += 1
             index: dict[int, list[tuple[int, int]]] = {}
             for opcode, at, body in mcap_scan.chunk_records(chunk.raw, self.budget):
                 stamp = self._inner(opcode, body)
@@ -221,8 +218,7 @@ class _Pass:
             channel = self.channels.get(number)
             if channel is None:
                 raise ValueError(f"a message names channel {number}, which is not defined before it")
-            schema = self.schemas.get(channel.schema_id)
-            topic = self.seen.topics.setdefault(channel.topic, TopicSeen(schema.name if schema else ""))
+            topic = self.seen.topics.setdefault(channel.topic, TopicSeen())
             topic.bytes += len(body) - MESSAGE.size
             topic.log_ns.append(log_ns)
             topic.publish_ns.append(publish_ns)
