@@ -95,7 +95,6 @@ class Player:
         """Added to the times of the toss that is played."""
         first = session.toss(session.tosses[0])
         self.cameras = first.cameras()
-        self.has_depth = len(first.depth()) > 0
         arm = first.arm_states()
         self.has_arm = arm is not None
         self.has_widths = arm is not None and bool(np.isfinite(arm.finger_width_m).any())

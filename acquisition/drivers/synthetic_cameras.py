@@ -37,11 +37,10 @@ class _Camera(SimulatedDevice):
         self._latency_ms = config.latency_ms if own_ms is None else own_ms
         self._clock = self._make_clock(config.skew_ppm[skew_number % len(config.skew_ppm)] * 1e-6)
         self._frame = 0
-        self._arrived_ns = 0
         self._again: Any = None
         self._held_back: Any = None
         self._moved_ns = 0
-        self._stepped = self._missed_triggers = 0
+        self._missed_triggers = 0
 
     def _make_clock(self, skew: float) -> DeviceClock:
         raise NotImplementedError
@@ -128,10 +127,17 @@ class _Camera(SimulatedDevice):
             return None
         return made
 
-    def _stored(self) -> Any:
-        """What a fault kept for this read."""
+    def read(self, timeout_s: float) -> Any:
+        """What a fault kept for this read, or what arrives; None: nothing within the timeout."""
         stored, self._again = self._again, None
-        return stored
+        if stored is not None:
+            return stored
+        frame = self._next(timeout_s)
+        return None if frame is None else self._delivered(self._made(frame))
+
+    def _made(self, frame: int) -> Any:
+        """What the camera hands over of a frame."""
+        raise NotImplementedError
 
 
 class SyntheticRgbd(_Camera):
@@ -146,20 +152,13 @@ class SyntheticRgbd(_Camera):
         start = wrap * 1000 - round(after_s * 1e9) if after_s >= 0 else 10**9
         return DeviceClock("d455 hardware", self._lab.stage.epoch_ns, skew, start, 1000, wrap)
 
-    def read(self, timeout_s: float) -> RgbdCapture | None:
-        stored = self._stored()
-        if stored is not None:
-            return stored
-        frame = self._next(timeout_s)
-        if frame is None:
-            return None
+    def _made(self, frame: int) -> RgbdCapture:
         host_ns = time.monotonic_ns()
         exposure_s = self._lab.show.color_exposure_s
         color = self._image("d455/color", frame, host_ns, exposure_s)
         depth = self._image("d455/depth", frame, host_ns, exposure_s)
         without = self._faults.active("no_depth") is not None
-        made = RgbdCapture(color, None if without else depth, self._lab.show.depth_unit_m, aligned=True)
-        return self._delivered(made)
+        return RgbdCapture(color, None if without else depth, self._lab.show.depth_unit_m, aligned=True)
 
     def set_emitter(self, on: bool) -> None:
         pass  # the simulated pattern is invisible to the colour camera
@@ -183,16 +182,9 @@ class SyntheticMono(_Camera):
             f"{self._stream} hardware", self._lab.stage.epoch_ns, skew, (self._number + 5) * 10**12, 1, None
         )
 
-    def read(self, timeout_s: float) -> Image | None:
-        stored = self._stored()
-        if stored is not None:
-            return stored
-        frame = self._next(timeout_s)
-        if frame is None:
-            return None
+    def _made(self, frame: int) -> Image:
         made = self._image(self._stream, frame, time.monotonic_ns(), self._lab.show.mono_exposure_s)
-        made = replace(made, stream="image")
-        return self._delivered(made)
+        return replace(made, stream="image")
 
     def trigger(self) -> None:
         raise DeviceRefused(f"{self.name} waits for the hardware trigger (simulated)")
