@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from processing import backends
 from processing.given_masks import add_masks_argument
 from processing.variants import CONTACT_ONLY, DEFAULT, NAMES, TRACKERS, WITH_MODEL, rows_of
-from recordings.console import Outcome, Parser, command_parser, progress_for, run_command, shared_board
+from recordings.console import Outcome, Parser, chosen_tosses, command_parser, progress_for, run_command, shared_board
 from recordings.errors import BadInput, TosslabError
 from recordings.notices import Notice
 
@@ -284,7 +284,7 @@ def _vision(args: argparse.Namespace, engine: Engine, session: Session, name: st
     from processing.start import start_run, with_table
 
     model = None if args.model is None else learned_shape_of(args.model)
-    tosses = chosen_tosses(args.toss, session.tosses)
+    tosses = chosen_tosses(args.toss, session.tosses, "--toss")
     progress = progress_for if isinstance(engine, InTurn) else Shown()
     run = start_run(session, tosses, out, config_of(args), args.tracker, progress, args.device, engine)
     run = _started(args, with_table(run) if args.table_from_depth else run)
@@ -371,19 +371,6 @@ def _out_folder(args: argparse.Namespace, session: Session, several: bool) -> Pa
     if _by_name(args, path):
         return SAMPLE_RESULTS
     return path / "results" if path.is_dir() else path.with_name(f"{path.stem}_results")
-
-
-def chosen_tosses(given: str | None, there: Sequence[int]) -> list[int]:
-    """`--toss I` or `I-J`. Raises BadInput where nothing fits."""
-    if given is None:
-        return list(there)
-    first, _, last = given.partition("-")
-    if not first.isdigit() or (last and not last.isdigit()) or (given.endswith("-")):
-        raise BadInput(f"--toss {given}: wanted a toss number or a range, for example --toss 3 or --toss 0-8")
-    chosen = [t for t in there if int(first) <= t <= int(last or first)]
-    if not chosen:
-        raise BadInput(f"--toss {given}: the session has the tosses {', '.join(map(str, there)) or '(none)'}")
-    return chosen
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from processing.pose_source import DEFAULT_STEPS, find_poses
-from recordings.console import Outcome
+from recordings.console import Outcome, chosen_tosses
 from recordings.errors import BadInput
 from recordings.progress import Progress, Silent
 
@@ -91,32 +91,17 @@ def contact_only(
 def _split(there: Sequence[int], train: str | None, test: str | None) -> tuple[list[int], list[int]]:
     """Tosses to learn from and to roll out. Without --train: all but the last (of --test, all that are not in it)."""
     if train is not None:
-        learned = chosen(train, there, "--train")
+        learned = chosen_tosses(train, there, "--train")
         tested = (
-            chosen(test, there, "--test") if test is not None else [t for t in there if t not in learned] or learned
+            chosen_tosses(test, there, "--test")
+            if test is not None
+            else [t for t in there if t not in learned] or learned
         )
         return learned, tested
     if test is not None:
-        tested = chosen(test, there, "--test")
+        tested = chosen_tosses(test, there, "--test")
         learned = [t for t in there if t not in tested]
         if not learned:
             raise BadInput(f"--test {test} takes every toss; wanted some left to learn from, or give --train I-J")
         return learned, tested
     return (list(there[:-1]) or list(there))[:MOST_TOSSES_LEARNED], list(there)
-
-
-def chosen(given: str, there: Sequence[int], option: str) -> list[int]:
-    """`I` or `I-J`: those numbers that exist. Raises BadInput where none does."""
-    first, dash, last = given.partition("-")
-    if not first.isdigit() or (dash and not last.isdigit()):
-        raise BadInput(f"{option} {given}: wanted a toss number or a range, for example {option} 0-15")
-    if dash and int(last) < int(first):
-        raise BadInput(f"{option} {given}: the range ends before it begins; wanted {option} {last}-{first}")
-    found = [t for t in there if int(first) <= t <= int(last or first)]
-    if not found:
-        raise BadInput(f"{option} {given}: no such tosses; the session has {_span(there)}")
-    return found
-
-
-def _span(there: Sequence[int]) -> str:
-    return f"{len(there)} tosses, {there[0]} to {there[-1]}" if there else "no tosses"

@@ -26,11 +26,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NoReturn
 
-from recordings.errors import TosslabError
+from recordings.errors import BadInput, TosslabError
 from recordings.progress import Board, Console, Log, Progress
 from recordings.system_libraries import advice
 
 DONE, FELL_SHORT, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
+MOST_LISTED = 20
+"""Of more tosses only the first and the last are named."""
 
 
 @dataclass(frozen=True)
@@ -158,6 +160,22 @@ def without_library_warnings() -> Iterator[None]:
         if not sys.warnoptions:
             warnings.simplefilter("ignore")
         yield
+
+
+def chosen_tosses(given: str | None, there: Sequence[int], option: str) -> list[int]:
+    """`I` or `I-J`: those numbers that exist; all where nothing is given. Raises BadInput where none does."""
+    if given is None:
+        return list(there)
+    first, dash, last = given.partition("-")
+    if not first.isdigit() or (dash and not last.isdigit()):
+        raise BadInput(f"{option} {given}: wanted a toss number or a range, for example {option} 3 or {option} 0-8")
+    if dash and int(last) < int(first):
+        raise BadInput(f"{option} {given}: the range ends before it begins; wanted {option} {last}-{first}")
+    chosen = [t for t in there if int(first) <= t <= int(last or first)]
+    if not chosen:
+        listed = ", ".join(map(str, there)) if len(there) <= MOST_LISTED else f"{there[0]} to {there[-1]}"
+        raise BadInput(f"{option} {given}: no such tosses; the session has the tosses {listed or '(none)'}")
+    return chosen
 
 
 def has_display() -> bool:

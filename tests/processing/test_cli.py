@@ -15,10 +15,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from processing.cli import chosen_tosses, config_of, main
+from processing.cli import config_of, main
 from processing.field.learn import LearnConfig
 from processing.field.train import FieldConfig
 from processing.stages import track as track_stage
+from recordings.console import chosen_tosses
 from recordings.errors import BadInput
 from recordings.results.folder import Results
 
@@ -314,9 +315,9 @@ def test_bad_input_is_refused_and_nothing_is_overwritten(
 
 
 def test_ranges_of_tosses() -> None:
-    assert chosen_tosses(None, [0, 2, 5]) == [0, 2, 5]
-    assert chosen_tosses("2", [0, 2, 5]) == [2]
-    assert chosen_tosses("1-5", [0, 2, 5]) == [2, 5]
+    assert chosen_tosses(None, [0, 2, 5], "--toss") == [0, 2, 5]
+    assert chosen_tosses("2", [0, 2, 5], "--toss") == [2]
+    assert chosen_tosses("1-5", [0, 2, 5], "--toss") == [2, 5]
 
 
 def test_masks_of_a_session_reach_the_truth(tiny_world: Any, record_tiny: Record, capsys: Any) -> None:

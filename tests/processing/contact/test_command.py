@@ -8,9 +8,10 @@ import pytest
 import torch
 
 from processing.contact.physics.geometry import CORNERS
-from processing.contact_command import chosen, contact_only
+from processing.contact_command import contact_only
 from processing.motion.trajectory import rotation_matrices
 from processing.pose_source import PoseSource, find_poses, in_frame_of
+from recordings.console import chosen_tosses
 from recordings.errors import BadInput
 from recordings.geometry import Transform
 from recordings.records import StampedPose
@@ -230,8 +231,8 @@ def test_errors_are_drawn_of_rollouts_that_go_on_after_every_toss(tmp_path):
 
 
 def test_ranges_take_the_tosses_that_exist():
-    assert chosen("3-8", (3, 4, 7, 9), "--train") == [3, 4, 7]
-    assert chosen("9", (3, 4, 7, 9), "--train") == [9]
+    assert chosen_tosses("3-8", (3, 4, 7, 9), "--train") == [3, 4, 7]
+    assert chosen_tosses("9", (3, 4, 7, 9), "--train") == [9]
 
 
 def test_a_session_without_poses_is_refused(sample_session, tmp_path):
