@@ -19,22 +19,18 @@ ASSETS = "assets"
 """`<contact stage>/assets/<format>/` holds the asset of a format with its meshes."""
 
 
-def export_urdf(
-    source: Path, out: Path, variant: str | None = None, scope: str | None = None, progress: Progress | None = None
-) -> ExportReport:
+def export_urdf(source: Path, out: Path, variant: str | None, scope: str | None, progress: Progress) -> ExportReport:
     """Write a URDF and its meshes."""
     return _export("urdf", source, out, variant, scope)
 
 
-def export_mjcf(
-    source: Path, out: Path, variant: str | None = None, scope: str | None = None, progress: Progress | None = None
-) -> ExportReport:
+def export_mjcf(source: Path, out: Path, variant: str | None, scope: str | None, progress: Progress) -> ExportReport:
     """Write a MuJoCo model and its meshes."""
     return _export("mjcf", source, out, variant, scope)
 
 
 def export_drake_sdf(
-    source: Path, out: Path, variant: str | None = None, scope: str | None = None, progress: Progress | None = None
+    source: Path, out: Path, variant: str | None, scope: str | None, progress: Progress
 ) -> ExportReport:
     """Write an SDFormat model for Drake and its meshes."""
     return _export("drake-sdf", source, out, variant, scope)

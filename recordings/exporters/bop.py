@@ -5,7 +5,6 @@ scene_gt.json holds the ESTIMATED poses: the layout has no other place for them.
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +13,11 @@ from jaxtyping import UInt16
 from numpy import ndarray as Array
 
 from recordings.errors import BadInput
-from recordings.exporters.common import ExportReport, count_files, new_files, open_results
+from recordings.exporters.common import ExportReport, count_files, new_files, open_results, write_document
 from recordings.exporters.images import depth_png, image_file
 from recordings.exporters.mesh import shapes
 from recordings.geometry import CameraModel
-from recordings.progress import Progress, Silent
+from recordings.progress import Progress
 from recordings.session import Session, Toss
 from recordings.tracks import ObjectShape, ObjectTrack
 
@@ -28,11 +27,8 @@ RESULTS_HEAD = "scene_id,im_id,obj_id,score,R,t,time\n"
 TARGET_KEYS = ("scene_id", "im_id", "obj_id", "inst_count")
 
 
-def export_bop(
-    source: Path, out: Path, variant: str | None = None, scope: str | None = None, progress: Progress | None = None
-) -> ExportReport:
+def export_bop(source: Path, out: Path, variant: str | None, scope: str | None, progress: Progress) -> ExportReport:
     """Write models/, test/<toss>/{rgb,depth,scene_camera.json,scene_gt.json} and tosslab_<object>-test.csv."""
-    progress = progress or Silent()
     results = open_results(source)
     record = results.find(variant, scope)
     path = results.session_path(record.name, record.scope)
@@ -43,7 +39,7 @@ def export_bop(
     lines = [RESULTS_HEAD]
     with new_files(out) as made:
         _write_models(made / "models", list(shapes(results, record).values()))
-        _write_json(made / "camera.json", _camera_json(session.calibration.camera(CAMERA)))
+        write_document(made / "camera.json", _camera_json(session.calibration.camera(CAMERA)))
         for done, (toss, track) in enumerate(tracks.items()):
             progress.step(done, len(tracks), f"toss {toss}")
             lines += _write_scene(made / "test", session, session.toss(toss), track, object_ids[toss])
@@ -57,11 +53,6 @@ def export_bop(
 
 def _word(name: str) -> str:
     return "".join(c for c in name.lower() if c.isalnum()) or "object"
-
-
-def _write_json(path: Path, document: Any) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(document, indent=1) + "\n")
 
 
 def _camera_json(camera: CameraModel) -> dict[str, Any]:
@@ -88,7 +79,7 @@ def _write_models(folder: Path, models: list[ObjectShape]) -> None:
         size = dict(zip(("size_x", "size_y", "size_z"), (high - low).tolist(), strict=True))
         start = dict(zip(("min_x", "min_y", "min_z"), low.tolist(), strict=True))
         info[str(i)] = {"diameter": diameter(mesh.convex_hull.vertices), **start, **size}
-    _write_json(folder / "models_info.json", info)
+    write_document(folder / "models_info.json", info)
 
 
 def diameter(hull: Array) -> float:
@@ -121,8 +112,8 @@ def _write_scene(folder: Path, session: Session, toss: Toss, track: ObjectTrack,
             R, t = pose.rotation.reshape(-1).tolist(), (pose.translation_m * MM).tolist()
             poses[str(i)] = [{"cam_R_m2c": R, "cam_t_m2c": t, "obj_id": object_id}]
             lines.append(f"{toss.index},{i},{object_id},1,{' '.join(map(repr, R))},{' '.join(map(repr, t))},-1\n")
-    _write_json(scene / "scene_camera.json", cameras)
-    _write_json(scene / "scene_gt.json", poses)
+    write_document(scene / "scene_camera.json", cameras)
+    write_document(scene / "scene_gt.json", poses)
     return lines
 
 
@@ -152,4 +143,4 @@ def _tenths(depth_m: Array) -> UInt16[Array, "h w"]:
 def _write_targets(path: Path, tracks: dict[int, ObjectTrack], object_ids: dict[int, int]) -> None:
     """Every frame is asked for: a lost one then counts as not found."""
     rows = [(toss, i, object_ids[toss], 1) for toss, track in tracks.items() for i in range(len(track.status))]
-    _write_json(path, [dict(zip(TARGET_KEYS, row, strict=True)) for row in rows])
+    write_document(path, [dict(zip(TARGET_KEYS, row, strict=True)) for row in rows])

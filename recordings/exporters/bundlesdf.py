@@ -14,7 +14,7 @@ from recordings.exporters.common import ExportReport, count_files, new_files, op
 from recordings.exporters.images import depth_png, image_file
 from recordings.geometry import CameraModel
 from recordings.mcap.codec import encode_mask
-from recordings.progress import Progress, Silent
+from recordings.progress import Progress
 from recordings.results.folder import Results
 from recordings.session import Session, Toss
 from recordings.session_writer import toss_name
@@ -24,13 +24,12 @@ MM = 1000.0
 
 
 def export_bundlesdf(
-    source: Path, out: Path, variant: str | None = None, scope: str | None = None, progress: Progress | None = None
+    source: Path, out: Path, variant: str | None, scope: str | None, progress: Progress
 ) -> ExportReport:
     """Write OUT/toss_XX/{rgb,depth,masks}/%06d and cam_K.txt; masks of every frame from results.
 
     Depth in millimetres is kept to the last bit, any other unit is rounded to millimetres and the report says so.
     """
-    progress = progress or Silent()
     results = Results.open(source) if Results.is_results(source) else None
     record = results.find(variant, scope) if results is not None else None
     session = open_recording(source, variant, scope)

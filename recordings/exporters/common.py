@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from recordings.errors import BadInput, WriteFailed
 from recordings.results.folder import Results
@@ -70,6 +72,12 @@ def new_file(out: Path) -> Path:
     if out.exists():
         raise BadInput(f"{out} exists already; nothing was overwritten. Choose another name or remove it")
     return out
+
+
+def write_document(path: Path, document: Any, indent: int = 1) -> None:
+    """A JSON file as other programs read it; its folder is made."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(document, indent=indent) + "\n")
 
 
 def count_files(folder: Path) -> int:

@@ -5,7 +5,6 @@ Images keep their bytes, depth its numbers, times their nanoseconds: what the la
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,11 +14,11 @@ from jaxtyping import Int64
 from numpy import ndarray as Array
 
 from recordings.errors import BadInput
-from recordings.exporters.common import ExportReport, count_files, new_files, open_recording
+from recordings.exporters.common import ExportReport, count_files, new_files, open_recording, write_document
 from recordings.exporters.images import depth_png, image_file
 from recordings.geometry import CameraModel
 from recordings.mcap.codec import encode_mask
-from recordings.progress import Progress, Silent
+from recordings.progress import Progress
 from recordings.records import ArmStates, EncodedImage
 from recordings.session import Frames, Session, Toss
 from recordings.session_writer import toss_name
@@ -30,18 +29,15 @@ SAME = 1e-9
 """A number of the calibration that differs by less from the one that was imported is that one."""
 
 
-def export_folder(
-    source: Path, out: Path, variant: str | None = None, scope: str | None = None, progress: Progress | None = None
-) -> ExportReport:
+def export_folder(source: Path, out: Path, variant: str | None, scope: str | None, progress: Progress) -> ExportReport:
     """Write session.json, toss_XX/, mono/ and calibration/ of a session (or of the one that results were made from)."""
-    progress = progress or Silent()
     session = open_recording(source, variant, scope)
     notes: list[str] = []
     with new_files(out) as made:
         for done, number in enumerate(session.tosses):
             progress.step(done, len(session.tosses), f"toss {number}")
             _write_toss(made, session.toss(number), notes)
-        _write_json(made / "session.json", _document(session))
+        write_document(made / "session.json", _document(session))
         _write_mono_cameras(made, session)
         _write_views(made, session)
         files = count_files(made)
@@ -124,7 +120,7 @@ def _write_toss(made: Path, toss: Toss, notes: list[str]) -> None:
     if not paired:
         _write_stamps(folder / "depth_timestamps.txt", depths.times_ns - clock_ns)
     _write_mask(folder, toss, notes)
-    _write_json(folder / "toss.json", _about(toss, len(colors), clock_ns))
+    write_document(folder / "toss.json", _about(toss, len(colors), clock_ns))
     arm = toss.arm_states()
     if arm is not None:
         (folder / "arm.csv").write_text(arm_csv(arm, clock_ns))
@@ -140,11 +136,6 @@ def _write(folder: Path, number: int, file: tuple[str, bytes]) -> None:
     suffix, data = file
     folder.mkdir(parents=True, exist_ok=True)
     (folder / f"{number:06d}{suffix}").write_bytes(data)
-
-
-def _write_json(path: Path, document: Mapping[str, Any]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(document, indent=1) + "\n")
 
 
 def _write_stamps(path: Path, times_ns: Int64[Array, " n"]) -> None:
@@ -220,7 +211,7 @@ def _write_mono_cameras(made: Path, session: Session) -> None:
     document["cameras"] = [{"name": n, **_camera(session.calibration.camera(n), {})} for n in names]
     if session.start.get("board"):
         document["calibration_board"] = session.start["board"]
-    _write_json(made / "mono" / "cameras.json", document)
+    write_document(made / "mono" / "cameras.json", document)
 
 
 def _write_views(made: Path, session: Session) -> None:

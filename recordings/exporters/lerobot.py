@@ -11,7 +11,6 @@ The format asks for a regular grid: grid frame k of an episode is at k / fps, ho
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -22,12 +21,12 @@ from numpy import ndarray as Array
 
 from recordings import sync
 from recordings.errors import BadInput
-from recordings.exporters.common import ExportReport, count_files, new_files, open_recording
+from recordings.exporters.common import ExportReport, count_files, new_files, open_recording, write_document
 from recordings.exporters.images import depth_png
 from recordings.exporters.lerobot_files import Column, Statistics, Video, write_data, write_episodes, write_tasks
 from recordings.geometry import quaternion_from_rotation
 from recordings.mcap.codec import decode_image
-from recordings.progress import Progress, Silent
+from recordings.progress import Progress
 from recordings.records import ArmStates
 from recordings.results.folder import Results
 from recordings.session import Session, Toss
@@ -55,11 +54,8 @@ class _Dataset:
         self.columns.setdefault(name, Column(dtype, names)).values.extend(values)
 
 
-def export_lerobot(
-    source: Path, out: Path, variant: str | None = None, scope: str | None = None, progress: Progress | None = None
-) -> ExportReport:
+def export_lerobot(source: Path, out: Path, variant: str | None, scope: str | None, progress: Progress) -> ExportReport:
     """Write a LeRobot v3 dataset of a session; of results, with its pose (d455_from_object, NaN where lost)."""
-    progress = progress or Silent()
     session = open_recording(source, variant, scope)
     tracks = Results.open(source).tracks(variant, scope) if Results.is_results(source) else {}
     numbers = tuple(tracks) or session.tosses
@@ -77,8 +73,8 @@ def export_lerobot(
         write_episodes(made / "meta" / _path("episodes", "parquet"), dataset.episodes, task)
         for name, column in dataset.columns.items():
             statistics.add_column(name, column)
-        _write_json(made / "meta" / "stats.json", statistics.to_json())
-        _write_json(made / "meta" / "info.json", _info(session, dataset, (camera.height, camera.width)))
+        write_document(made / "meta" / "stats.json", statistics.to_json(), 4)
+        write_document(made / "meta" / "info.json", _info(session, dataset, (camera.height, camera.width)), 4)
         files = count_files(made)
     progress.step(len(numbers), len(numbers))
     session.close()
@@ -100,11 +96,6 @@ def _path(kind: str, suffix: str) -> str:
 
 def _video_path(made: Path) -> Path:
     return made / "videos" / VIDEO / "chunk-000" / "file-000.mp4"
-
-
-def _write_json(path: Path, document: Any) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(document, indent=4) + "\n")
 
 
 def _fps(session: Session, numbers: tuple[int, ...]) -> int:

@@ -16,16 +16,13 @@ from recordings.exporters.common import ExportReport, new_files, open_recording
 from recordings.mcap import codec
 from recordings.mcap.file import McapFile, Message
 from recordings.mcap.writer import McapWriter
-from recordings.progress import Progress, Silent
+from recordings.progress import Progress
 
 DEPTH_SCHEMA = "tosslab.DepthImage"
 
 
-def export_mcap(
-    source: Path, out: Path, variant: str | None = None, scope: str | None = None, progress: Progress | None = None
-) -> ExportReport:
+def export_mcap(source: Path, out: Path, variant: str | None, scope: str | None, progress: Progress) -> ExportReport:
     """Write OUT/toss_XX.mcap (and calibration.mcap where there is one)."""
-    progress = progress or Silent()
     session = open_recording(source, variant, scope)
     files = [session.file(n) for n in session.tosses]
     views = session.path / "calibration.mcap"

@@ -12,9 +12,7 @@ from recordings.session_writer import toss_name
 from recordings.tracks import ObjectShape
 
 
-def export_mesh(
-    source: Path, out: Path, variant: str | None = None, scope: str | None = None, progress: Progress | None = None
-) -> ExportReport:
+def export_mesh(source: Path, out: Path, variant: str | None, scope: str | None, progress: Progress) -> ExportReport:
     """Write `shape.obj`; where every toss has its own shape (scope one), `toss_XX/shape.obj`."""
     results = open_results(source)
     record = results.find(variant, scope)

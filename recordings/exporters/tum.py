@@ -13,9 +13,7 @@ from recordings.tracks import ObjectTrack
 LOST = "nan nan nan nan nan nan nan"
 
 
-def export_tum(
-    source: Path, out: Path, variant: str | None = None, scope: str | None = None, progress: Progress | None = None
-) -> ExportReport:
+def export_tum(source: Path, out: Path, variant: str | None, scope: str | None, progress: Progress) -> ExportReport:
     """Write `toss_XX.txt` (`time_s tx ty tz qx qy qz qw` of `d455_from_object`) and `toss_XX.status.txt`.
 
     `time_s` counts from the toss's first colour frame. Every frame has its line; a lost one is `time_s nan nan ...`.

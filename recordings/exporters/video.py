@@ -10,7 +10,7 @@ from recordings.errors import BadInput
 from recordings.exporters.common import ExportReport, new_files, open_recording, open_results
 from recordings.film.file import movie_codec, write_gif, write_mp4
 from recordings.film.film import Film
-from recordings.progress import Progress, Silent
+from recordings.progress import Progress
 from recordings.results.folder import Results, VariantRecord
 from recordings.session import Session
 from recordings.session_writer import toss_name
@@ -21,20 +21,18 @@ SLOWED = 4
 CODEC_NAMES = {"libx264": "H.264", "mpeg4": "MPEG-4 part 2"}
 
 
-def export_video(
-    source: Path, out: Path, variant: str | None = None, scope: str | None = None, progress: Progress | None = None
-) -> ExportReport:
+def export_video(source: Path, out: Path, variant: str | None, scope: str | None, progress: Progress) -> ExportReport:
     """Write `toss_XX.mp4`, or `toss_XX.gif` where PyAV is missing: one frame for every colour frame."""
     results = open_results(source)
     record = results.find(variant, scope)
     session = open_recording(results.path, record.name, record.scope)
-    codec, shown = movie_codec(), progress or Silent()
+    codec = movie_codec()
     try:
         with new_files(out) as made:
             tracks = results.tracks(record.name, record.scope)
             for k, (toss, track) in enumerate(tracks.items()):
                 _write(made, _film(results, record, session, track), codec)
-                shown.step(k + 1, len(tracks), f"toss {toss}")
+                progress.step(k + 1, len(tracks), f"toss {toss}")
     finally:
         session.close()
     return ExportReport("video", out, len(tracks), _notes(codec))

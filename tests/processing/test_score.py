@@ -18,7 +18,7 @@ import trimesh
 from processing.evaluate.score import VariantScore, score_variant
 from processing.evaluate.table import collect, markdown, table_document
 from processing.evaluate.truth import Truth
-from recordings.exporters.tum import export_tum
+from recordings.exporters.export import export
 from recordings.geometry import CameraModel, rotation_exp
 from recordings.results.folder import Results, Scope, TossRecord, VariantRecord, write_shape, write_track, write_variant
 from recordings.tracks import ObjectShape, ObjectTrack, RigCalibration, Status
@@ -183,7 +183,7 @@ def independent(scorer: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
     def ask(folders: Folders, *options: str) -> dict:
         out = tmp_path / f"{len(list(tmp_path.iterdir()))}-tum"
-        export_tum(folders.results, out)
+        export("tum", folders.results, out)
         given = [str(folders.truth), str(out), "--json", str(out / "out.json"), *options]
         monkeypatch.setattr(sys, "argv", ["score.py", *given])
         assert scorer.main() == 0

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from recordings.errors import BadInput
-from recordings.exporters.bundlesdf import export_bundlesdf
+from recordings.exporters.export import export
 from recordings.importers.bundlesdf import import_bundlesdf
 from recordings.session import Session, Toss
 
@@ -32,21 +32,21 @@ def check_round_trip(source: Path, back: Path) -> None:
 
 def test_a_folder_comes_back_as_it_was(bundlesdf_folder, tmp_path):
     import_bundlesdf([bundlesdf_folder], tmp_path / "session")
-    export_bundlesdf(tmp_path / "session", tmp_path / "back")
+    export("bundlesdf", tmp_path / "session", tmp_path / "back")
     check_round_trip(bundlesdf_folder, tmp_path / "back" / "toss_00")
 
 
 def test_the_real_frames_of_the_jack_come_back_as_they_were(data, tmp_path):
     report = import_bundlesdf([data("jack_push")], tmp_path / "session")
     assert report.streams["/d455/color"] == 84
-    export_bundlesdf(tmp_path / "session", tmp_path / "back")
+    export("bundlesdf", tmp_path / "session", tmp_path / "back")
     check_round_trip(data("jack_push"), tmp_path / "back" / "toss_00")
     assert Session.open(tmp_path / "session").toss(0).masks()[0].sum() == 4982
 
 
 def test_what_was_exported_comes_in_again_as_the_same_tosses(bundlesdf_folder, tmp_path):
     import_bundlesdf([bundlesdf_folder, bundlesdf_folder], tmp_path / "session", fps=25.0)
-    export_bundlesdf(tmp_path / "session", tmp_path / "back")
+    export("bundlesdf", tmp_path / "session", tmp_path / "back")
     import_bundlesdf([tmp_path / "back"], tmp_path / "again", fps=25.0)
     one, two = Session.open(tmp_path / "session"), Session.open(tmp_path / "again")
     assert one.tosses == two.tosses == (0, 1)

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from recordings.errors import BadInput, TosslabError, WriteFailed
-from recordings.exporters.folder import export_folder
+from recordings.exporters.export import export
 from recordings.importers.folder import import_folder
 from recordings.mcap.codec import decode_image
 from recordings.session import Session, Toss
@@ -64,14 +64,14 @@ def test_the_folder_layout_comes_back_as_it_was(layout, tmp_path):
     report = import_folder(layout.path, tmp_path / "session")
     assert report.tosses == (0, 3)
     assert report.warnings == ()
-    export_folder(tmp_path / "session", tmp_path / "back")
+    export("folder", tmp_path / "session", tmp_path / "back")
     check_round_trip(layout.path, tmp_path / "back")
 
 
 @pytest.mark.parametrize("name", [pytest.param("cube_dev", marks=pytest.mark.slow), "lab_dev"])
 def test_the_shared_recordings_come_back_as_they_were(data: Callable[[str], Path], tmp_path, name):
     import_folder(data(name), tmp_path / "session")
-    export_folder(tmp_path / "session", tmp_path / "back")
+    export("folder", tmp_path / "session", tmp_path / "back")
     check_round_trip(data(name), tmp_path / "back")
 
 
@@ -83,7 +83,7 @@ def test_depth_times_of_their_own_come_back(layout, tmp_path):
     frames = Session.open(tmp_path / "session").toss(0).rgbd()
     assert frames.depth_times_ns[2] - frames.times_ns[2] == 5_000_123
     assert frames.without_depth == (4,)
-    export_folder(tmp_path / "session", tmp_path / "back")
+    export("folder", tmp_path / "session", tmp_path / "back")
     text = (tmp_path / "back" / "toss_00" / "depth_timestamps.txt").read_text()
     assert text.split() == ["-0.005000000", "0.038001000", "0.071657123", "0.138321000"]
     assert not (tmp_path / "back" / "toss_03" / "depth_timestamps.txt").exists()
@@ -355,7 +355,7 @@ def test_depth_that_is_not_aligned_is_kept_and_aligned_when_read(layout, tmp_pat
     assert any("not aligned" in w for w in report.warnings)
     frame = Session.open(tmp_path / "session").toss(0).rgbd()[0]
     assert frame.depth_m[24, 32] == pytest.approx(0.7)
-    export_folder(tmp_path / "session", tmp_path / "back")
+    export("folder", tmp_path / "session", tmp_path / "back")
     document = json.loads((tmp_path / "back" / "session.json").read_text())
     assert document["T_camera_depth"] == place.tolist()
     assert document["camera"]["depth_aligned_to_color"] is False
@@ -368,7 +368,7 @@ def test_frames_that_are_missing_keep_their_numbers_and_times(layout, tmp_path):
     layout.lines("timestamps.txt", lambda lines: lines[:2] + lines[3:])
     report = import_folder(layout.path, tmp_path / "session")
     assert any("toss.json says 5 frames" in w for w in report.warnings)
-    export_folder(tmp_path / "session", tmp_path / "back")
+    export("folder", tmp_path / "session", tmp_path / "back")
     check_round_trip(layout.path, tmp_path / "back")
 
 
