@@ -20,7 +20,7 @@ from acquisition.interrupts import Interrupts
 from acquisition.live import LiveSession, require_follower
 from acquisition.operator import Keyboard, Nobody, Operator, Unattended, single_keys
 from acquisition.preflight import Preflight, of_recording, preflight
-from acquisition.ready_rig import Setup
+from acquisition.ready_rig import Setup, with_factory_models
 from acquisition.rig import Rig
 from acquisition.run import Options, SessionReport, SessionRun
 from acquisition.setup import set_up
@@ -82,6 +82,7 @@ def _record(
         elif setup.lab is not None:
             setup.thrower.prepare(first, 0, progress_for("preparing the simulated lab"))
         open_things.enter_context(recorder)
+        setup = replace(setup, calibration=with_factory_models(setup.calibration, recorder.devices.values()))
         if args.preview:
             open_things.enter_context(_preview(recorder))
         if setup.live:

@@ -29,7 +29,7 @@ from jaxtyping import Float, Int64, UInt8, UInt16
 from numpy import ndarray as Array
 
 from recordings.errors import TosslabError
-from recordings.geometry import CameraModel
+from recordings.geometry import CameraModel, Transform
 
 
 class DeviceLost(TosslabError):
@@ -261,7 +261,11 @@ class RgbdCamera(Device, Protocol):
         """The infrared dot projector; while streaming too."""
 
     def cameras(self) -> Mapping[str, CameraModel]:
-        """The factory's intrinsics by stream: "color", "depth", "infrared1", "infrared2"."""
+        """While it streams, the factory's intrinsics by stream: "color", "depth", "infrared1", "infrared2". Empty for
+        the replay of a session that does not have them."""
+
+    def color_from_depth(self) -> Transform:
+        """The factory's extrinsics of depth in the colour camera's optical frame (the identity when aligned)."""
 
 
 @runtime_checkable

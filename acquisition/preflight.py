@@ -257,7 +257,7 @@ def _off_px(calibration: RigCalibration, name: str, corners_px: Mapping[int, Flo
 
 def calibration_age(calibration: RigCalibration, hours: float, now_s: float) -> Iterator[Row]:
     """Whether there is a calibration, and how old it is."""
-    if not calibration.cameras:
+    if not any("world" in (t.target, t.source) for t in calibration.transforms):
         wanted = "toss-record --calibration board, toss-calibrate, then calibration = ... in the rig file"
         yield Row("calibration", "", "warning", "none: the session gets no camera poses", wanted)
         return

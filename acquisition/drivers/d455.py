@@ -30,9 +30,9 @@ from acquisition.drivers.realsense_setup import (
     set_up,
 )
 from recordings.errors import BadInput, DeviceNotFound
-from recordings.geometry import CameraModel
+from recordings.geometry import CameraModel, Transform
 from recordings.importers.common import Warnings
-from recordings.importers.realsense import camera_model
+from recordings.importers.realsense import camera_model, color_from_depth
 
 COLOR_FRAME, DEPTH_FRAME = "d455", "d455_depth"
 QUEUE = 32
@@ -159,6 +159,11 @@ class D455Camera(OpenedByContext):
                 self._stream(f"infrared{index}"), f"d455_ir{index}", self._warnings
             )
         return models
+
+    def color_from_depth(self) -> Transform:
+        if self._settings.align:
+            return Transform.identity(COLOR_FRAME, COLOR_FRAME)
+        return color_from_depth(self._stream("depth"), self._stream("color"), COLOR_FRAME, DEPTH_FRAME)
 
     def health(self) -> Health:
         received = {name: counter.received for name, counter in self._counters.items()}

@@ -43,7 +43,7 @@ from acquisition.drivers.lifecycle import OpenedByContext
 from acquisition.ready_rig import Setup
 from acquisition.rig import DeviceEntry, RecordingConfig, Rig
 from recordings.errors import BadInput
-from recordings.geometry import CameraModel
+from recordings.geometry import CameraModel, Transform
 from recordings.mcap.codec import decode_image
 from recordings.progress import Progress
 from recordings.records import ArmStates, DepthImage, EncodedImage
@@ -286,9 +286,14 @@ class ReplayRgbd(_Replayed):
         pass  # what was recorded was recorded
 
     def cameras(self) -> Mapping[str, CameraModel]:
-        calibration = self._player.session.calibration
-        color = calibration.camera(self.name)
-        return {"color": color, "depth": calibration.cameras.get(f"{self.name}_depth", color)}
+        cameras = self._player.session.calibration.cameras
+        color = cameras.get(self.name)
+        return {} if color is None else {"color": color, "depth": cameras.get(f"{self.name}_depth", color)}
+
+    def color_from_depth(self) -> Transform:
+        if self._player.aligned(self.name):
+            return Transform.identity(self.name, self.name)
+        return self._player.session.calibration.transform(self.name, f"{self.name}_depth")
 
 
 class ReplayMono(_Replayed):

@@ -19,7 +19,7 @@ from acquisition.devices import (
 from acquisition.drivers.synthetic_device import DeviceClock, SimulatedDevice
 from acquisition.synthetic.lab_state import LabState
 from acquisition.synthetic.random_draws import generator
-from recordings.geometry import CameraModel
+from recordings.geometry import CameraModel, Transform
 
 QUIET_NS = 10_000_000
 """How often a camera that says nothing looks whether it may speak again."""
@@ -165,6 +165,9 @@ class SyntheticRgbd(_Camera):
 
     def cameras(self) -> Mapping[str, CameraModel]:
         return {"color": self._lab.show.cameras()["d455"], "depth": self._lab.show.cameras()["d455"]}
+
+    def color_from_depth(self) -> Transform:
+        return Transform.identity("d455", "d455")
 
     def describe(self) -> dict[str, Any]:
         return self._described("simulated D455", self._lab.config.fps)

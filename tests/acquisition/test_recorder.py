@@ -14,16 +14,19 @@ from typing import Any
 import numpy as np
 import pytest
 
+from acquisition import command
 from acquisition.cli import main
 from acquisition.detect import Moment, TossEvents
 from acquisition.judge import judge
 from acquisition.rig import RecordingConfig
+from acquisition.setup import set_up
 from acquisition.streaming.sequence_check import Trouble
 from acquisition.streaming.stream_queue import Item, StreamQueue, Take
 from acquisition.streaming.streams import BoundedQueue, Counter, Tally
 from recordings.mcap.toss_writer import TossWriter
 from recordings.session import Session
 from recordings.session_writer import SessionWriter
+from recordings.tracks import RigCalibration
 from recordings.verify.verify import verify
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -276,6 +279,19 @@ def test_every_toss_of_a_session_is_replayed_though_its_cameras_are_not_in_all_o
                 assert after[topic].count == before[topic].count
         assert b.toss(0).streams()["/mono2/image"].count == 36
     assert verify(again).ok
+
+
+def test_a_rig_without_a_calibration_records_its_cameras_own_lenses(
+    rig: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bare = set_up(rig)
+    bare.calibration = RigCalibration(cameras={})
+    monkeypatch.setattr(command, "set_up", lambda _: bare)
+    assert main(["--rig", rig, "--yes", "--tosses", "1", str(tmp_path / "out")]) == 0
+    with Session.open(tmp_path / "out") as session:
+        assert session.calibration.camera("d455").width == 212
+        assert session.calibration.find("world", "d455") is None
+    assert "the session gets no camera poses" in capsys.readouterr().err
 
 
 @pytest.mark.slow

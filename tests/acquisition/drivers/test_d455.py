@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +15,11 @@ from acquisition.devices import DeviceLost, DeviceRefused, RgbdCapture
 from acquisition.drivers import realsense_parts as parts
 from acquisition.drivers import realsense_setup as setup
 from acquisition.drivers.d455 import D455Camera, D455Settings
+from acquisition.ready_rig import with_factory_models
 from acquisition.simulators.realsense_db3 import SoftwareD455
 from recordings.errors import BadInput, DeviceNotFound
+from recordings.geometry import Transform
+from recordings.tracks import RigCalibration
 
 BAG = "librealsense_bag/unit-tests/resources/single_depth_color_640x480.bag"
 
@@ -53,6 +57,26 @@ def test_colour_and_raw_depth_come_apart_each_with_its_own_stamp(db3: Callable[.
     assert (place.target, place.source) == ("d455", "d455_depth")
     assert place.translation_m == pytest.approx([-0.059, 0, 0])
     assert models["color"].distortion_model == "brown-conrady"
+
+
+@pytest.mark.parametrize("align", [False, True])
+def test_a_session_gets_the_factorys_lenses_and_where_raw_depth_was_seen_from(
+    db3: Callable[..., Path], align: bool
+) -> None:
+    measured = RigCalibration({}, (Transform("world", "d455", np.eye(3), np.array([0.0, 0.0, 1.0])),))
+    with D455Camera(file=db3("plain"), playback="fast", settings=D455Settings(align=align)) as camera:
+        camera.start()
+        models = camera.cameras()
+        made = with_factory_models(measured, [camera])
+        assert with_factory_models(made, [camera]).to_json() == made.to_json()  # what is known stays
+        smaller = replace(made, cameras={"d455": replace(models["color"], width=320)})
+        with pytest.raises(BadInput, match=r"d455 is 320x\d+, the camera sends \d+x\d+; wanted one size"):
+            with_factory_models(smaller, [camera])
+    np.testing.assert_array_equal(made.cameras["d455"].K, models["color"].K)
+    assert made.find("world", "d455") is not None
+    assert ("d455_depth" in made.cameras) is not align
+    if not align:
+        assert made.transform("d455", "d455_depth").translation_m == pytest.approx([-0.059, 0, 0])
 
 
 def test_the_devices_microseconds_wrap_and_gaps_are_counted(db3: Callable[..., Path]) -> None:
