@@ -22,6 +22,7 @@ from processing.segment.background.foreground import (
     window_around,
 )
 from processing.segment.background.late_depth import LateDepthSettings, at_color_time, way_px
+from processing.segment.background.placement import best_shift
 from processing.segment.background.static_scene import StaticScene
 from recordings.records import RgbdFrame
 
@@ -128,6 +129,9 @@ def _center(mask: Bool[Array, "h w"]) -> Float[Array, "2"]:
     return np.array([moments["m10"], moments["m01"]]) / max(moments["m00"], 1.0)
 
 
+MOST_REACH_PX = 150
+
+
 def reach_px(area_px: int, steps: int) -> int:
     """How far around the expected mask the object is sought, or something that may touch it, after so many frames."""
     return int(0.6 * np.sqrt(area_px)) * steps + 4
@@ -142,11 +146,9 @@ def follow(
     s: BackgroundSettings,
 ) -> Found:
     """The mask in the next frame; empty with confidence 0 where the object is not found."""
-    shift = memory.velocity_px * (memory.missed + 1)
-    expected = _shifted(memory.mask, shift)
-    area = int(memory.mask.sum())
-    reach = reach_px(area, memory.missed + 1)
-    near = grown(expected, min(reach, 150))
+    area, steps = int(memory.mask.sum()), memory.missed + 1
+    reach = min(reach_px(area, steps), MOST_REACH_PX)
+    near = grown(_shifted(memory.mask, memory.velocity_px * steps), reach) | grown(memory.mask, reach)
     way = way_px(frame, memory.speed_px_s)
     far_px = float(np.linalg.norm(way))
     if far_px > s.late.least_px:
@@ -159,6 +161,8 @@ def follow(
         moved &= scene.known | nearer_than_scene(frame.depth_m, scene, s.foreground) | alike
     if block is not None:
         moved &= ~block
+    expected = _shifted(memory.mask, _best_shift(frame, moved, near, memory, cues, reach))
+    near = grown(expected, reach)
     rough = component_in(moved, near)
     if cues is not None:
         rough |= _other_pieces(frame, moved & ~rough, expected, cues, memory, s)
@@ -188,6 +192,23 @@ def follow(
     others_near = int((solid & ~grown(mask, 3)).sum()) > s.least_px or int((solid & ~mask).sum()) > 3 * s.least_px
     largest = _largest_other(frame, scene, moved & ~grown(mask, 9), s)
     return Found(mask, float(np.clip(sure * min(1.0, ratio / 0.7), 0, 1)), others_near, largest)
+
+
+def _best_shift(
+    frame: RgbdFrame,
+    moved: Bool[Array, "h w"],
+    near: Bool[Array, "h w"],
+    memory: Memory,
+    cues: RobotCues | None,
+    reach: int,
+) -> Float[Array, "2"]:
+    """How far (x, y; pixels) the object has come since it was last found: to what moved and has its colours."""
+    score, at = np.zeros(moved.shape, np.float32), window_around(near, 0)
+    if at is not None:
+        odds = memory.likeness.log_odds(frame.color_rgb[at], crowded=memory.others_near)
+        odds = odds if cues is None else np.where(cues.odds[at] != 0, cues.odds[at], odds)
+        score[at] = moved[at] / (1 + np.exp(-odds))
+    return best_shift(score, memory.mask, memory.velocity_px, memory.missed + 1, reach)
 
 
 def _moved_by_depth(

@@ -10,6 +10,7 @@ import pytest
 from processing.segment.background.follow import BackgroundSettings, Found, _is_all_object, follow, remember
 from processing.segment.background.foreground import ForegroundSettings
 from processing.segment.background.late_depth import LateDepthSettings, at_color_time, way_px
+from processing.segment.background.placement import best_shift
 from processing.segment.background.static_scene import StaticScene
 from recordings.records import RgbdFrame
 
@@ -75,3 +76,33 @@ def test_a_body_may_lie_off_the_expected_place_by_its_way_between_the_exposures(
     seen = frame((np.s_[40:70, 50:102], RED, 0.7))
     memory = remember(None, seen, Found(expected, 1.0))
     assert _is_all_object(seen, rough, expected, memory, way_px, BackgroundSettings()) == own
+
+
+@pytest.mark.parametrize("missed", [0, 3])
+def test_a_body_that_an_impact_stopped_is_found_where_it_stopped(missed: int) -> None:
+    first = np.zeros((H, W), dtype=bool)
+    first[BEFORE] = True
+    memory = remember(None, frame((BEFORE, RED, 0.7)), Found(first, 1.0))
+    memory = replace(memory, velocity_px=np.array([38.0, 0.0]), missed=missed, others_near=True)
+    stopped = frame((np.s_[41:71, 53:83], RED, 0.7))
+    found = follow(stopped, empty_scene(), memory, None, None, BackgroundSettings())
+    body = np.zeros((H, W), dtype=bool)
+    body[41:71, 53:83] = True
+    assert (found.mask & body).sum() / (found.mask | body).sum() > 0.9
+
+
+@pytest.mark.parametrize("moved_px", [(12, 5), (6, 3), (0, 0), (-3, 4)])
+def test_a_mask_lies_where_most_of_it_looks_like_the_object_whether_it_flies_on_or_not(
+    moved_px: tuple[int, int],
+) -> None:
+    mask, score = np.zeros((H, W), dtype=bool), np.zeros((H, W), np.float32)
+    mask[40:52, 50:70] = True
+    score[:20] = 1.0  # something else, out of reach
+    score[40 + moved_px[1] : 52 + moved_px[1], 50 + moved_px[0] : 70 + moved_px[0]] = 0.9
+    np.testing.assert_array_equal(best_shift(score, mask, np.array([12.0, 5.0]), 1, 13), moved_px)
+
+
+def test_without_a_trace_of_the_object_its_motion_goes_on() -> None:
+    mask, velocity = np.zeros((H, W), dtype=bool), np.array([7.0, -3.0])
+    mask[100:115, 5:20] = True
+    np.testing.assert_array_equal(best_shift(np.zeros((H, W), np.float32), mask, velocity, 2, 20), 2 * velocity)
