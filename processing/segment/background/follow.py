@@ -22,7 +22,8 @@ from processing.segment.background.foreground import (
     window_around,
 )
 from processing.segment.background.late_depth import LateDepthSettings, at_color_time, way_px
-from processing.segment.background.placement import best_shift
+from processing.segment.background.others import Others, beside, without_others
+from processing.segment.background.placement import best_shift, shifted
 from processing.segment.background.static_scene import StaticScene
 from recordings.records import RgbdFrame
 
@@ -73,8 +74,8 @@ class Memory:
     depth_range_m: tuple[float, float]
     likeness: Likeness
     missed: int = 0
-    others_near: bool = False
-    """Something else that is not scene was near the object in the last frame: a hand, a stick."""
+    others: Others | None = None
+    """What else that is not scene was near the object in the last frame: a hand, a stick."""
     time_ns: int = 0
     speed_px_s: Float[Array, "2"] = field(default_factory=lambda: np.zeros(2))
     """Colour's time when the object was last found, and how fast it then moved in the image."""
@@ -87,7 +88,8 @@ class Found:
 
     mask: Bool[Array, "h w"]
     confidence: float
-    others_near: bool = False
+    others: Bool[Array, "h w"] | None = None
+    """Pixels near the object that are neither scene nor robot nor the object."""
     largest_other_px: int = 0
 
 
@@ -105,10 +107,12 @@ def remember(memory: Memory | None, frame: RgbdFrame, found: Found, learn: bool 
     mask = found.mask
     if memory is not None and not mask.any():
         return replace(memory, missed=memory.missed + 1)
+    others = Others.seen(frame, found.others, None if memory is None else memory.others)
     depth = frame.depth_m[mask & (frame.depth_m > 0)]
     low, high = (float(d) for d in np.quantile(depth, (0.02, 0.98))) if len(depth) > 10 else (0.0, 20.0)
     if memory is None:
-        return Memory(mask, np.zeros(2), (low, high), Likeness.of(frame.color_rgb, mask), time_ns=frame.time_ns)
+        likeness = Likeness.of(frame.color_rgb, mask)
+        return Memory(mask, np.zeros(2), (low, high), likeness, others=others, time_ns=frame.time_ns)
     way = _center(mask) - _center(memory.mask)
     likeness = memory.likeness.learned(frame.color_rgb, mask) if learn else memory.likeness
     speed = way / ((frame.time_ns - memory.time_ns) * 1e-9) if frame.time_ns != memory.time_ns else np.zeros(2)
@@ -117,7 +121,7 @@ def remember(memory: Memory | None, frame: RgbdFrame, found: Found, learn: bool 
         way / (memory.missed + 1),
         (low, high),
         likeness,
-        others_near=found.others_near,
+        others=others,
         time_ns=frame.time_ns,
         speed_px_s=speed,
     )
@@ -130,6 +134,7 @@ def _center(mask: Bool[Array, "h w"]) -> Float[Array, "2"]:
 
 
 MOST_REACH_PX = 150
+MOST_ODDS = 8.0
 
 
 def reach_px(area_px: int, steps: int) -> int:
@@ -148,11 +153,11 @@ def follow(
     """The mask in the next frame; empty with confidence 0 where the object is not found."""
     area, steps = int(memory.mask.sum()), memory.missed + 1
     reach = min(reach_px(area, steps), MOST_REACH_PX)
-    near = grown(_shifted(memory.mask, memory.velocity_px * steps), reach) | grown(memory.mask, reach)
+    near = grown(shifted(memory.mask, memory.velocity_px * steps), reach) | grown(memory.mask, reach)
     way = way_px(frame, memory.speed_px_s)
     far_px = float(np.linalg.norm(way))
     if far_px > s.late.least_px:
-        body = component_in(_moved_by_depth(frame, scene, block, s), _shifted(near, -way))
+        body = component_in(_moved_by_depth(frame, scene, block, s), shifted(near, -way))
         frame = at_color_time(frame, scene, body, way, s.late, s.foreground)
         s = replace(s, foreground=s.late.at_border(s.foreground))
     moved = moved_pixels(frame, scene, s.foreground)
@@ -161,27 +166,33 @@ def follow(
         moved &= scene.known | nearer_than_scene(frame.depth_m, scene, s.foreground) | alike
     if block is not None:
         moved &= ~block
-    expected = _shifted(memory.mask, _best_shift(frame, moved, near, memory, cues, reach))
-    near = grown(expected, reach)
-    rough = component_in(moved, near)
+    came_px = _best_shift(frame, moved, near, memory, cues, reach)
+    expected = shifted(memory.mask, came_px)
+    near, own = grown(expected, reach), moved
+    if memory.others is not None and cues is None:
+        shares = memory.likeness.object_shares
+        own = without_others(frame, scene, moved, expected, came_px, memory.others, shares, reach, s.foreground)
+    rough = component_in(own, near)
     if cues is not None:
         rough |= _other_pieces(frame, moved & ~rough, expected, cues, memory, s)
     if rough.sum() < s.least_px:
         return Found(np.zeros_like(rough), 0.0)
     wide = grown(rough, 5)
     unknown = ~scene.known if cues is None else cues.unknown
-    if not memory.others_near:  # where nothing else is near, depth before the table suffices
+    if memory.others is None:  # where nothing else is near, depth before the table suffices
         unknown = unknown & (scene.depth_m == 0)
     strange = (wide & unknown).sum() > s.unknown * rough.sum()
     larger = rough.sum() > s.grown * area
     if strange or (larger and not _is_all_object(frame, rough, expected, memory, far_px, s)):
-        rough = _among_others(frame, scene, moved, expected, memory, cues, s)
+        rough = _among_others(frame, scene, own, expected, memory, cues, s)
         if rough.sum() < s.least_px:
-            return Found(np.zeros_like(rough), 0.0, others_near=True)
+            return Found(np.zeros_like(rough), 0.0)
         mask, sure = rough, 0.6
     else:
         least = None if cues is None else s.piece_px
         bare = None if scene.known[wide].all() else np.where(scene.known, 0, memory.likeness.log_odds(frame.color_rgb))
+        if own is not moved:
+            bare = np.where(moved & ~own, -MOST_ODDS, 0.0 if bare is None else bare)
         # where the scene's colour is known, it decides; the robot's colours speak against the object only
         odds = bare if cues is None else np.where(scene.known, np.minimum(cues.odds, 0), cues.odds)
         mask, sure = refine_border(frame, scene, rough, odds, s.foreground, least)
@@ -189,9 +200,10 @@ def follow(
         mask = mask & ~block
     ratio = min(mask.sum(), area) / max(mask.sum(), area, 1)
     solid = moved & near & (frame.depth_m > 0)  # what only looks different may be the object's shadow
-    others_near = int((solid & ~grown(mask, 3)).sum()) > s.least_px or int((solid & ~mask).sum()) > 3 * s.least_px
+    solid &= ~(grown(rough, 3) if own is moved else rough)
+    others = beside(frame, scene, solid, rough, s.foreground, s.least_px)
     largest = _largest_other(frame, scene, moved & ~grown(mask, 9), s)
-    return Found(mask, float(np.clip(sure * min(1.0, ratio / 0.7), 0, 1)), others_near, largest)
+    return Found(mask, float(np.clip(sure * min(1.0, ratio / 0.7), 0, 1)), others, largest)
 
 
 def _best_shift(
@@ -205,7 +217,7 @@ def _best_shift(
     """How far (x, y; pixels) the object has come since it was last found: to what moved and has its colours."""
     score, at = np.zeros(moved.shape, np.float32), window_around(near, 0)
     if at is not None:
-        odds = memory.likeness.log_odds(frame.color_rgb[at], crowded=memory.others_near)
+        odds = memory.likeness.log_odds(frame.color_rgb[at], crowded=memory.others is not None)
         odds = odds if cues is None else np.where(cues.odds[at] != 0, cues.odds[at], odds)
         score[at] = moved[at] / (1 + np.exp(-odds))
     return best_shift(score, memory.mask, memory.velocity_px, memory.missed + 1, reach)
@@ -234,11 +246,6 @@ def _largest_other(frame: RgbdFrame, scene: StaticScene, moved: Bool[Array, "h w
     return 0
 
 
-def _shifted(mask: Bool[Array, "h w"], by_px: Float[Array, "2"]) -> Bool[Array, "h w"]:
-    moved = np.array([[1, 0, by_px[0]], [0, 1, by_px[1]]], dtype=np.float32)
-    return cv2.warpAffine(mask.astype(np.uint8), moved, mask.shape[::-1], flags=cv2.INTER_NEAREST) > 0
-
-
 def component_in(mask: Bool[Array, "h w"], region: Bool[Array, "h w"]) -> Bool[Array, "h w"]:
     """The component that has most pixels in a region."""
     count, labels = cv2.connectedComponents(mask.astype(np.uint8), connectivity=4)
@@ -263,7 +270,7 @@ def _is_all_object(
     """
     added = rough & ~expected
     reach = cv2.distanceTransform((~expected).astype(np.uint8), cv2.DIST_L2, 3)[added]
-    if memory.others_near or np.quantile(reach, 0.95) > s.turned * np.sqrt(memory.mask.sum()) + way_px:
+    if np.quantile(reach, 0.95) > s.turned * np.sqrt(memory.mask.sum()) + way_px:
         return False
     low, high = memory.depth_range_m
     depth = frame.depth_m[added & (frame.depth_m > 0)]

@@ -107,6 +107,13 @@ def shadow_distance(color: Float32[Array, "*n 3"], scene: Float32[Array, "*n 3"]
     return np.linalg.norm(color - np.clip(shade, 0.0, lit)[..., None] * scene, axis=-1).astype(np.float32)
 
 
+def scene_colored(frame: RgbdFrame, scene: StaticScene, at: Window, s: ForegroundSettings) -> Bool[Array, "a b"]:
+    """Pixels of a window that show the scene's colour, in the light or in a shadow."""
+    color, before = frame.color_rgb[at].astype(np.float32), scene.color_rgb[at].astype(np.float32)
+    noise = s.color_step + 3 * scene.color_sigma[at]
+    return np.asarray(scene.known[at] & (shadow_distance(color, before, s.lit) <= noise))
+
+
 def pixel_log_odds(
     frame: RgbdFrame,
     scene: StaticScene,

@@ -35,14 +35,16 @@ SAME_SCENE = 0.6
 """Another toss shows the same scene where so much of its depth agrees; object, hand and robot come and go."""
 CORNERS = 250
 LEAST_CORNERS = 40
+STILL_SHARE = 0.25
+"""So many of the corners at least are on what stands still."""
 FOLLOW: Mapping[str, Any] = {"winSize": (21, 21), "maxLevel": 3}
 
 
 def picture_shifts(colors: Sequence[UInt8[Array, "h w 3"]], hidden: Sequence[Bool[Array, "h w"]] | None) -> list[float]:
     """How far the picture as a whole has shifted (px) from the middle frame; NaN where too little can be followed.
 
-    It is the median over the followed corners of each one's distance, so that less than half of them may be on things
-    that really move.
+    It is the first quartile of the followed corners' distances: before a plain room most corners lie on what really
+    moves, an object, a hand, an arm; when the camera moves, all do.
     """
     middle = len(colors) // 2
     others = colors[:: max(1, len(colors) // 16)]
@@ -110,4 +112,4 @@ def _shift(reference: UInt8[Array, "h w"], other: UInt8[Array, "h w"], corners: 
     good = followed & (np.linalg.norm(np.asarray(back) - corners, axis=-1).ravel() < 0.5)
     if good.sum() < LEAST_CORNERS:
         return float("nan")
-    return float(np.median(np.linalg.norm(np.asarray(there) - corners, axis=-1).ravel()[good]))
+    return float(np.quantile(np.linalg.norm(np.asarray(there) - corners, axis=-1).ravel()[good], STILL_SHARE))

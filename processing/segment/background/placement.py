@@ -42,6 +42,12 @@ def best_shift(
     return np.array([x[row, column], y[row, column]])
 
 
+def shifted(mask: Bool[Array, "h w"], by_px: Float[Array, "2"]) -> Bool[Array, "h w"]:
+    """A mask moved by (x, y) pixels."""
+    moved = np.array([[1, 0, by_px[0]], [0, 1, by_px[1]]], dtype=np.float32)
+    return cv2.warpAffine(mask.astype(np.uint8), moved, mask.shape[::-1], flags=cv2.INTER_NEAREST) > 0
+
+
 def _cut(image: Float32[Array, "h w"], first: Float[Array, "2"], last: Float[Array, "2"]) -> Float32[Array, "a b"]:
     """The part of an image between two corners (x, y), zero where there is none."""
     (left, top), (right, bottom) = first.astype(int), last.astype(int)

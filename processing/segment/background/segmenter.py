@@ -24,6 +24,7 @@ from processing.segment.background.follow import (
     remember,
 )
 from processing.segment.background.foreground import grown, moved_pixels, refine_border
+from processing.segment.background.others import beside
 from processing.segment.background.static_scene import (
     StaticScene,
     colorless,
@@ -130,7 +131,7 @@ class BackgroundSegmenter:
         first, s = self._leveled(frames[start])[0], self._settings
         scene = self._scene_without(first, seed.mask)
         for order in (range(start + 1, len(frames)), range(start - 1, -1, -1)):
-            memory = replace(remember(None, first, seed), others_near=self._held(first, scene, seed.mask))
+            memory = remember(None, first, replace(seed, others=self._held(first, scene, seed.mask)))
             if self._detection is not None:
                 memory = replace(memory, likeness=memory.likeness.with_shares(self._detection.shares))
             for i in order:
@@ -142,11 +143,14 @@ class BackgroundSegmenter:
                 memory = remember(memory, frame, found, learn=lit and found.confidence > s.sure)
                 yield i, found, lit
 
-    def _held(self, frame: RgbdFrame, scene: StaticScene, mask: Bool[Array, "h w"]) -> bool:
-        """Whether something that is neither scene nor a known robot stands beside the object, as a hand does."""
+    def _held(self, frame: RgbdFrame, scene: StaticScene, mask: Bool[Array, "h w"]) -> Bool[Array, "h w"] | None:
+        """What is neither scene nor a known robot and stands beside the object, as a hand does."""
         s = self._settings
-        around = grown(mask, reach_px(int(mask.sum()), 1)) & ~grown(mask, 3)
-        return self._drawn is None and int((moved_pixels(frame, scene, s.foreground) & around).sum()) > 3 * s.least_px
+        if self._drawn is not None:
+            return None
+        around = grown(mask, reach_px(int(mask.sum()), 1)) & ~mask
+        solid = moved_pixels(frame, scene, s.foreground) & around
+        return beside(frame, scene, solid, mask, s.foreground, s.least_px)
 
     def _redetected(
         self,
