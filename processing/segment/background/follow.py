@@ -163,7 +163,7 @@ def follow(
     moved = moved_pixels(frame, scene, s.foreground)
     if (moved & ~scene.known).any():
         alike = memory.likeness.log_odds(frame.color_rgb) > 0
-        moved &= scene.known | nearer_than_scene(frame.depth_m, scene, s.foreground) | alike
+        moved &= scene.known | alike
     if block is not None:
         moved &= ~block
     came_px = _best_shift(frame, moved, near, memory, cues, reach)
@@ -190,9 +190,8 @@ def follow(
         mask, sure = rough, 0.6
     else:
         least = None if cues is None else s.piece_px
-        bare = None if scene.known[wide].all() else np.where(scene.known, 0, memory.likeness.log_odds(frame.color_rgb))
-        if own is not moved:
-            bare = np.where(moved & ~own, -MOST_ODDS, 0.0 if bare is None else bare)
+        bare = memory.likeness.log_odds(frame.color_rgb)
+        bare = np.where(moved & ~own, -MOST_ODDS, bare)
         # where the scene's colour is known, it decides; the robot's colours speak against the object only
         odds = bare if cues is None else np.where(scene.known, np.minimum(cues.odds, 0), cues.odds)
         mask, sure = refine_border(frame, scene, rough, odds, s.foreground, least)

@@ -55,12 +55,13 @@ def beside(
     least_px: int,
 ) -> Bool[Array, "h w"] | None:
     """What of some pixels is a thing of its own, and not only the rim that a stereo camera adds to what is near: it has
-    another colour than the scene, somewhere it is wider than such a rim, and most of it lies farther from the object's
+    another colour than the scene that is known there, somewhere it is wider than such a rim, and most of it lies farther from the object's
     mask than a rim does. None where it is smaller than `least_px`."""
     at = window_around(solid, 0)
     if at is None or solid.sum() <= least_px:
         return None
-    seen = (solid[at] & ~scene_colored(frame, scene, at, s)).astype(np.uint8)
+    seen = (solid & scene.known)[at] & ~scene_colored(frame, scene, at, s)
+    seen = seen.astype(np.uint8)
     wide = cv2.morphologyEx(seen, cv2.MORPH_OPEN, kernel(max(1, s.band_inside_px // 2))) > 0
     count, labels = cv2.connectedComponents(seen, connectivity=4)
     sizes = np.bincount(labels.ravel(), minlength=count)
