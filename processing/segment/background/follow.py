@@ -73,6 +73,8 @@ class Memory:
     velocity_px: Float[Array, "2"]
     depth_range_m: tuple[float, float]
     likeness: Likeness
+    size_px: float
+    """The object's size: of its last masks the largest, which counts less by `SHRINKS` a frame. One bad mask is small."""
     missed: int = 0
     others: Others | None = None
     """What else that is not scene was near the object in the last frame: a hand, a stick."""
@@ -112,7 +114,7 @@ def remember(memory: Memory | None, frame: RgbdFrame, found: Found, learn: bool 
     low, high = (float(d) for d in np.quantile(depth, (0.02, 0.98))) if len(depth) > 10 else (0.0, 20.0)
     if memory is None:
         likeness = Likeness.of(frame.color_rgb, mask)
-        return Memory(mask, np.zeros(2), (low, high), likeness, others=others, time_ns=frame.time_ns)
+        return Memory(mask, np.zeros(2), (low, high), likeness, mask.sum(), others=others, time_ns=frame.time_ns)
     way = _center(mask) - _center(memory.mask)
     likeness = memory.likeness.learned(frame.color_rgb, mask) if learn else memory.likeness
     speed = way / ((frame.time_ns - memory.time_ns) * 1e-9) if frame.time_ns != memory.time_ns else np.zeros(2)
@@ -121,6 +123,7 @@ def remember(memory: Memory | None, frame: RgbdFrame, found: Found, learn: bool 
         way / (memory.missed + 1),
         (low, high),
         likeness,
+        max(mask.sum(), SHRINKS * memory.size_px),
         others=others,
         time_ns=frame.time_ns,
         speed_px_s=speed,
@@ -134,10 +137,11 @@ def _center(mask: Bool[Array, "h w"]) -> Float[Array, "2"]:
 
 
 MOST_REACH_PX = 150
+SHRINKS = 0.9
 MOST_ODDS = 8.0
 
 
-def reach_px(area_px: int, steps: int) -> int:
+def reach_px(area_px: float, steps: int) -> int:
     """How far around the expected mask the object is sought, or something that may touch it, after so many frames."""
     return int(0.6 * np.sqrt(area_px)) * steps + 4
 
@@ -151,7 +155,7 @@ def follow(
     s: BackgroundSettings,
 ) -> Found:
     """The mask in the next frame; empty with confidence 0 where the object is not found."""
-    area, steps = int(memory.mask.sum()), memory.missed + 1
+    area, steps = memory.size_px, memory.missed + 1
     reach = min(reach_px(area, steps), MOST_REACH_PX)
     near = grown(shifted(memory.mask, memory.velocity_px * steps), reach) | grown(memory.mask, reach)
     way = way_px(frame, memory.speed_px_s)
@@ -269,7 +273,7 @@ def _is_all_object(
     """
     added = rough & ~expected
     reach = cv2.distanceTransform((~expected).astype(np.uint8), cv2.DIST_L2, 3)[added]
-    if np.quantile(reach, 0.95) > s.turned * np.sqrt(memory.mask.sum()) + way_px:
+    if np.quantile(reach, 0.95) > s.turned * np.sqrt(memory.size_px) + way_px:
         return False
     low, high = memory.depth_range_m
     depth = frame.depth_m[added & (frame.depth_m > 0)]
