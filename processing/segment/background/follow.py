@@ -114,7 +114,7 @@ def remember(memory: Memory | None, frame: RgbdFrame, found: Found, learn: bool 
     low, high = (float(d) for d in np.quantile(depth, (0.02, 0.98))) if len(depth) > 10 else (0.0, 20.0)
     if memory is None:
         likeness = Likeness.of(frame.color_rgb, mask)
-        return Memory(mask, np.zeros(2), (low, high), likeness, mask.sum(), others=others, time_ns=frame.time_ns)
+        return Memory(mask, np.zeros(2), (low, high), likeness, float(mask.sum()), others=others, time_ns=frame.time_ns)
     way = _center(mask) - _center(memory.mask)
     likeness = memory.likeness.learned(frame.color_rgb, mask) if learn else memory.likeness
     speed = way / ((frame.time_ns - memory.time_ns) * 1e-9) if frame.time_ns != memory.time_ns else np.zeros(2)
@@ -123,7 +123,7 @@ def remember(memory: Memory | None, frame: RgbdFrame, found: Found, learn: bool 
         way / (memory.missed + 1),
         (low, high),
         likeness,
-        max(mask.sum(), SHRINKS * memory.size_px),
+        max(float(mask.sum()), SHRINKS * memory.size_px),
         others=others,
         time_ns=frame.time_ns,
         speed_px_s=speed,

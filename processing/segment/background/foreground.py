@@ -210,9 +210,10 @@ def _vote(
 
 
 def smooth(
-    log_odds: Float32[Array, "h w"], color: Float32[Array, "h w 3"], s: ForegroundSettings
+    log_odds: Float32[Array, "h w"], color: Float32[Array, "h w c"], s: ForegroundSettings
 ) -> Float32[Array, "h w"]:
-    """Mean field of an Ising model whose neighbours pull less across colour edges: -1 (scene) to 1 (object)."""
+    """Mean field of an Ising model whose neighbours pull less across edges of colour (of all its channels): -1 (scene)
+    to 1 (object)."""
     pulls = []
     for dy, dx in ((0, 1), (1, 0), (1, 1), (1, -1)):
         step = np.linalg.norm(color - np.roll(color, (-dy, -dx), (0, 1)), axis=-1)

@@ -148,7 +148,7 @@ class BackgroundSegmenter:
         s = self._settings
         if self._drawn is not None:
             return None
-        around = grown(mask, reach_px(int(mask.sum()), 1)) & ~mask
+        around = grown(mask, reach_px(float(mask.sum()), 1)) & ~mask
         solid = moved_pixels(frame, scene, s.foreground) & around
         return beside(frame, scene, solid, mask, s.foreground, s.least_px)
 

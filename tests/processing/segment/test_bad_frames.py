@@ -99,6 +99,19 @@ def test_a_camera_that_is_bumped_by_some_pixels_is_refused() -> None:
         refuse_moving_camera([room, room, *[np.roll(room, 3, axis=1)] * 2][::-1], None)
 
 
+def test_a_hand_that_moves_before_a_plain_room_is_not_a_camera_that_moves() -> None:
+    rng = np.random.default_rng(0)
+    hand = np.kron(rng.integers(0, 255, (12, 24, 3)), np.ones((6, 6, 1))).astype(np.uint8)
+    things = np.kron(rng.integers(0, 255, (4, 40, 3)), np.ones((6, 6, 1))).astype(np.uint8)
+    rooms = []
+    for k in range(4):  # a third of the corners stand still: the room's few things
+        room = np.full((180, 240, 3), 120, dtype=np.uint8)
+        room[:24] = things
+        room[60 + 6 * k : 132 + 6 * k, 40 : 40 + 144] = hand
+        rooms.append(room)
+    refuse_moving_camera(rooms, None)
+
+
 def test_given_masks_are_chosen_by_name() -> None:
     given = {3: np.ones((2, 2), bool), 0: np.zeros((2, 2), bool)}
     assert list(chosen_masks(given, "first", first_toss=False)) == [0]

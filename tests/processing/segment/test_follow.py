@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from processing.segment.background.follow import BackgroundSettings, Found, _is_all_object, follow, remember
-from processing.segment.background.foreground import ForegroundSettings
+from processing.segment.background.foreground import ForegroundSettings, grown
 from processing.segment.background.late_depth import LateDepthSettings, at_color_time, way_px
 from processing.segment.background.placement import best_shift
 from processing.segment.background.static_scene import StaticScene
@@ -39,9 +39,12 @@ def test_a_side_never_seen_before_is_the_bodys_own_unless_something_else_was_nea
     scene = empty_scene()
     first = np.zeros((H, W), dtype=bool)
     first[BEFORE] = True
-    memory = remember(None, frame((BEFORE, RED, 0.7)), Found(first, 1.0))
+    beside = np.zeros((H, W), dtype=bool)
+    beside[40:70, 84:110] = True
+    hand = frame((np.s_[40:70, 84:110], BLUE, 0.62), (BEFORE, RED, 0.7))
+    memory = remember(None, hand, Found(first, 1.0, beside if other_near else None))
     turned = frame((TURNED, BLUE, 0.62), (BEFORE, RED, 0.66))
-    found = follow(turned, scene, replace(memory, others_near=other_near), None, None, BackgroundSettings())
+    found = follow(turned, scene, memory, None, None, BackgroundSettings())
     body = np.zeros((H, W), dtype=bool)
     body[TURNED] = True
     overlap = (found.mask & body).sum() / (found.mask | body).sum()
@@ -83,7 +86,7 @@ def test_a_body_that_an_impact_stopped_is_found_where_it_stopped(missed: int) ->
     first = np.zeros((H, W), dtype=bool)
     first[BEFORE] = True
     memory = remember(None, frame((BEFORE, RED, 0.7)), Found(first, 1.0))
-    memory = replace(memory, velocity_px=np.array([38.0, 0.0]), missed=missed, others_near=True)
+    memory = replace(memory, velocity_px=np.array([38.0, 0.0]), missed=missed)
     stopped = frame((np.s_[41:71, 53:83], RED, 0.7))
     found = follow(stopped, empty_scene(), memory, None, None, BackgroundSettings())
     body = np.zeros((H, W), dtype=bool)
@@ -106,3 +109,49 @@ def test_without_a_trace_of_the_object_its_motion_goes_on() -> None:
     mask, velocity = np.zeros((H, W), dtype=bool), np.array([7.0, -3.0])
     mask[100:115, 5:20] = True
     np.testing.assert_array_equal(best_shift(np.zeros((H, W), np.float32), mask, velocity, 2, 20), 2 * velocity)
+
+
+SKIN, PAINT = (215, 170, 140), (225, 180, 150)
+
+
+@pytest.mark.parametrize("paint", [RED, PAINT])
+def test_a_hand_that_holds_the_object_is_never_taken_for_it_however_long_it_holds(paint: tuple[int, int, int]) -> None:
+    scene, settings = empty_scene(), BackgroundSettings()
+    held, hand = np.zeros((H, W), dtype=bool), np.zeros((H, W), dtype=bool)
+    held[50:80, 40:70], hand[50:80, 70:120] = True, True
+    memory = remember(None, picture(held, hand, paint, 0), Found(held, 1.0, hand))
+    for k in range(1, 12):  # together, to the right
+        mine, other = np.roll(held, 2 * k, 1), np.roll(hand, 2 * k, 1)
+        seen = picture(mine, other, paint, k)
+        found = follow(seen, scene, memory, None, None, settings)
+        assert overlap(found.mask, mine) > 0.9
+        memory = remember(memory, seen, found)
+    for k in range(1, 5):  # it opens and stays; the object falls
+        mine = np.roll(held, (6 * k, 22), (0, 1))
+        seen = picture(mine, np.roll(hand, 22 + 4 * k, 1), paint, 12 + k)
+        found = follow(seen, scene, memory, None, None, settings)
+        assert overlap(found.mask, mine) > 0.8
+        memory = remember(memory, seen, found)
+
+
+def test_one_bad_mask_does_not_make_the_object_small() -> None:
+    body, part = np.zeros((H, W), dtype=bool), np.zeros((H, W), dtype=bool)
+    body[40:70, 50:80], part[40:48, 50:60] = True, True
+    seen = frame((BEFORE, RED, 0.7))
+    memory = remember(remember(None, seen, Found(body, 1.0)), seen, Found(part, 0.5))
+    found = follow(seen, empty_scene(), memory, None, None, BackgroundSettings())
+    assert overlap(found.mask, body) > 0.95
+
+
+def picture(mine: np.ndarray, other: np.ndarray, paint: tuple[int, int, int], seed: int) -> RgbdFrame:
+    """An object and a hand at one depth that is fattened by 3 px, with noise."""
+    rng = np.random.default_rng(seed)
+    seen = frame()
+    color, depth = seen.color_rgb.astype(np.float64), seen.depth_m.copy()
+    color[other], color[mine] = SKIN, paint
+    depth[grown(mine | other, 3)] = 0.7
+    return replace(seen, color_rgb=(color + rng.normal(0, 3, color.shape)).clip(0, 255).astype(np.uint8), depth_m=depth)
+
+
+def overlap(a: np.ndarray, b: np.ndarray) -> float:
+    return float((a & b).sum() / (a | b).sum())
