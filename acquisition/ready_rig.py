@@ -36,8 +36,8 @@ class Setup:
 
 
 def with_factory_models(calibration: RigCalibration, devices: Iterable[Device]) -> RigCalibration:
-    """The calibration, completed by what the RGBD cameras say of themselves once they stream: raw depth has a lens and a
-    place of its own, and without them it would be taken for aligned to colour.
+    """The calibration, completed by what the RGBD cameras say of themselves once they stream: raw depth has a lens and
+    a place of its own, and without them it would be taken for aligned to colour.
 
     What was calibrated stays. Raises BadInput where it is of pictures of another size than the camera's.
     """

@@ -31,8 +31,8 @@ from recordings.errors import DeviceNotFound
 POP_US = 100_000
 LEAVE_S = 0.8
 HEARTBEAT_S = 12.0
-"""How long a camera is waited for that obeys a program which died (GigE Vision: 3 s without a word free it, more where a
-camera was set so) or that this process still leaves."""
+"""How long a camera is waited for that obeys a program which died (GigE Vision: 3 s without a word free it, or what
+the camera was set to), or that this process still leaves."""
 LOOK_S = 0.2
 _LEAVING: dict[str, threading.Thread] = {}
 """By Aravis' id, what still talks to a camera that this process has left: whoever opens it again waits for that."""

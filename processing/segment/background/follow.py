@@ -74,7 +74,7 @@ class Memory:
     depth_range_m: tuple[float, float]
     likeness: Likeness
     size_px: float
-    """The object's size: of its last masks the largest, which counts less by `SHRINKS` a frame. One bad mask is small."""
+    """The object's size: the largest of its last masks, worth less by `SHRINKS` a frame: a bad one is small."""
     missed: int = 0
     others: Others | None = None
     """What else that is not scene was near the object in the last frame: a hand, a stick."""

@@ -55,8 +55,8 @@ def beside(
     least_px: int,
 ) -> Bool[Array, "h w"] | None:
     """What of some pixels is a thing of its own, and not only the rim that a stereo camera adds to what is near: it has
-    another colour than the scene that is known there, somewhere it is wider than such a rim, and most of it lies farther from the object's
-    mask than a rim does. None where it is smaller than `least_px`."""
+    another colour than the scene that is known there, somewhere it is wider than such a rim, and most of it lies
+    farther from the object's mask than a rim does. None where it is smaller than `least_px`."""
     at = window_around(solid, 0)
     if at is None or solid.sum() <= least_px:
         return None
@@ -88,9 +88,9 @@ def without_others(
 ) -> Bool[Array, "h w"]:
     """The moved pixels near the object that are its own.
 
-    `expected` is where the object is expected, `way_px` (x, y) how far it has come since the last frame: the others came
-    with it, or stayed where they were. Colours that only one of them showed speak for it; a border between two that
-    look alike stays where it was. What shows the scene's colour is the object's only where the object is expected.
+    `expected` is where the object is expected, `way_px` (x, y) how far it has come since the last frame: the others
+    came with it, or stayed where they were. Colours that only one of them showed speak for it; a border between two that
+    look alike stays where it was. What shows the scene's colour is the object's only where that is expected.
     """
     out = np.zeros_like(moved)
     at = window_around(expected | others.mask, reach_px)

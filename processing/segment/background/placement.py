@@ -51,7 +51,6 @@ def shifted(mask: Bool[Array, "h w"], by_px: Float[Array, "2"]) -> Bool[Array, "
 def _cut(image: Float32[Array, "h w"], first: Float[Array, "2"], last: Float[Array, "2"]) -> Float32[Array, "a b"]:
     """The part of an image between two corners (x, y), zero where there is none."""
     (left, top), (right, bottom) = first.astype(int), last.astype(int)
-    h, w = image.shape
     inner = image[max(top, 0) : max(bottom, 0), max(left, 0) : max(right, 0)]
     out = np.zeros((bottom - top, right - left), np.float32)
     y, x = max(-top, 0), max(-left, 0)
