@@ -194,8 +194,8 @@ def follow(
         mask, sure = rough, 0.6
     else:
         least = None if cues is None else s.piece_px
-        bare = memory.likeness.log_odds(frame.color_rgb)
-        bare = np.where(moved & ~own, -MOST_ODDS, bare)
+        bare = _likeness_near(frame, memory, rough)
+        bare[moved & ~own] = -MOST_ODDS
         # where the scene's colour is known, it decides; the robot's colours speak against the object only
         odds = bare if cues is None else np.where(scene.known, np.minimum(cues.odds, 0), cues.odds)
         mask, sure = refine_border(frame, scene, rough, odds, s.foreground, least)
@@ -207,6 +207,14 @@ def follow(
     others = beside(frame, scene, solid, rough, s.foreground, s.least_px)
     largest = _largest_other(frame, scene, moved & ~grown(mask, 9), s)
     return Found(mask, float(np.clip(sure * min(1.0, ratio / 0.7), 0, 1)), others, largest)
+
+
+def _likeness_near(frame: RgbdFrame, memory: Memory, region: Bool[Array, "h w"]) -> Float32[Array, "h w"]:
+    """Log-odds of the object's colours in and around a region; 0 elsewhere."""
+    out, at = np.zeros(region.shape, np.float32), window_around(region, 30)
+    if at is not None:
+        out[at] = memory.likeness.log_odds(frame.color_rgb[at], crowded=False)
+    return out
 
 
 def _best_shift(
@@ -242,9 +250,11 @@ def _largest_other(frame: RgbdFrame, scene: StaticScene, moved: Bool[Array, "h w
     for k in order:
         if stats[k, cv2.CC_STAT_AREA] < s.least_px:
             break
-        thing = labels == k
-        apart = np.abs(frame.color_rgb[thing] - scene.color_rgb[thing]).max(-1)
-        if (apart > np.maximum(s.foreground.color_step, 4 * scene.color_sigma[thing])).mean() > 0.5:
+        left, top, width, height = stats[k, :4]
+        at = np.s_[top : top + height, left : left + width]
+        thing = labels[at] == k
+        apart = np.abs(frame.color_rgb[at][thing] - scene.color_rgb[at][thing]).max(-1)
+        if (apart > np.maximum(s.foreground.color_step, 4 * scene.color_sigma[at][thing])).mean() > 0.5:
             return int(stats[k, cv2.CC_STAT_AREA])
     return 0
 
