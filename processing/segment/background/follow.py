@@ -61,7 +61,7 @@ class BackgroundSettings:
     """Another thing that moves and is larger than this share of the object is counted."""
     part_of_scene: float = 0.9
     """An object less of which stands out from the scene than this was partly learned as scene."""
-    unknown: float = 0.02
+    unknown: float = 0.1
     """A component with a larger share of pixels whose scene is unknown is judged by its own colours."""
 
 
@@ -183,8 +183,6 @@ def follow(
         return Found(np.zeros_like(rough), 0.0)
     wide = grown(rough, 5)
     unknown = ~scene.known if cues is None else cues.unknown
-    if memory.others is None:  # where nothing else is near, depth before the table suffices
-        unknown = unknown & (scene.depth_m == 0)
     strange = (wide & unknown).sum() > s.unknown * rough.sum()
     larger = rough.sum() > s.grown * area
     if strange or (larger and not _is_all_object(frame, rough, expected, memory, far_px, s)):

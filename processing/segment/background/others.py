@@ -90,7 +90,7 @@ def without_others(
 
     `expected` is where the object is expected, `way_px` (x, y) how far it has come since the last frame: the others
     came with it, or stayed where they were. Colours that only one of them showed speak for it; a border between two who
-    look alike stays where it was. What shows the scene's colour is the object's only where that is expected.
+    that look alike stays where it was. What shows the scene's colour is the object's only where that is expected.
     """
     out = np.zeros_like(moved)
     at = window_around(expected | others.mask, reach_px)
