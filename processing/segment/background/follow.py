@@ -22,7 +22,7 @@ from processing.segment.background.foreground import (
     window_around,
 )
 from processing.segment.background.late_depth import LateDepthSettings, at_color_time, way_px
-from processing.segment.background.others import Others, beside, without_others
+from processing.segment.background.others import Others, largest_other, things_near, without_others
 from processing.segment.background.placement import best_shift, shifted
 from processing.segment.background.static_scene import StaticScene
 from recordings.records import RgbdFrame
@@ -85,8 +85,7 @@ class Memory:
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """The object in one frame. `others_near`: something near it is neither scene nor robot nor the object;
-    `largest_other_px`: the pixels of the largest such thing anywhere."""
+    """The object in one frame. `largest_other_px`: the largest other thing in the picture."""
 
     mask: Bool[Array, "h w"]
     confidence: float
@@ -155,55 +154,115 @@ def follow(
     s: BackgroundSettings,
 ) -> Found:
     """The mask in the next frame; empty with confidence 0 where the object is not found."""
-    area, steps = memory.size_px, memory.missed + 1
-    reach = min(reach_px(area, steps), MOST_REACH_PX)
-    near = grown(shifted(memory.mask, memory.velocity_px * steps), reach) | grown(memory.mask, reach)
-    way = way_px(frame, memory.speed_px_s)
-    far_px = float(np.linalg.norm(way))
-    if far_px > s.late.least_px:
-        body = component_in(_moved_by_depth(frame, scene, block, s), shifted(near, -way))
-        frame = at_color_time(frame, scene, body, way, s.late, s.foreground)
-        s = replace(s, foreground=s.late.at_border(s.foreground))
-    moved = moved_pixels(frame, scene, s.foreground)
-    if (moved & ~scene.known).any():
-        alike = memory.likeness.log_odds(frame.color_rgb) > 0
-        moved &= scene.known | alike
-    if block is not None:
-        moved &= ~block
-    came_px = _best_shift(frame, moved, near, memory, cues, reach)
-    expected = shifted(memory.mask, came_px)
-    near, own = grown(expected, reach), moved
-    if memory.others is not None and cues is None:
-        shares = memory.likeness.object_shares
-        own = without_others(frame, scene, moved, expected, came_px, memory.others, shares, reach, s.foreground)
-    rough = component_in(own, near)
+    reach = min(reach_px(memory.size_px, memory.missed + 1), MOST_REACH_PX)
+    onward = shifted(memory.mask, memory.velocity_px * (memory.missed + 1))
+    near = grown(onward, reach) | grown(memory.mask, reach)
+    frame, s, far_px = _at_color_time(frame, scene, memory, near, block, s)
+    sought = _sought(frame, scene, memory, near, reach, block, cues, s)
+    rough = component_in(sought.own, sought.near)
     if cues is not None:
-        rough |= _other_pieces(frame, moved & ~rough, expected, cues, memory, s)
+        rough |= _other_pieces(frame, sought.moved & ~rough, sought.expected, cues, memory, s)
     if rough.sum() < s.least_px:
         return Found(np.zeros_like(rough), 0.0)
-    wide = grown(rough, 5)
     unknown = ~scene.known if cues is None else cues.unknown
-    strange = (wide & unknown).sum() > s.unknown * rough.sum()
-    larger = rough.sum() > s.grown * area
-    if strange or (larger and not _is_all_object(frame, rough, expected, memory, far_px, s)):
-        rough = _among_others(frame, scene, own, expected, memory, cues, s)
+    strange = (grown(rough, 5) & unknown).sum() > s.unknown * rough.sum()
+    larger = rough.sum() > s.grown * memory.size_px
+    if strange or (larger and not _is_all_object(frame, rough, sought.expected, memory, far_px, s)):
+        rough = _among_others(frame, scene, sought.own, sought.expected, memory, cues, s)
         if rough.sum() < s.least_px:
             return Found(np.zeros_like(rough), 0.0)
         mask, sure = rough, 0.6
     else:
-        least = None if cues is None else s.piece_px
-        bare = _likeness_near(frame, memory, rough)
-        bare[moved & ~own] = -MOST_ODDS
-        # where the scene's colour is known, it decides; the robot's colours speak against the object only
-        odds = bare if cues is None else np.where(scene.known, np.minimum(cues.odds, 0), cues.odds)
-        mask, sure = refine_border(frame, scene, rough, odds, s.foreground, least)
+        mask, sure = _bordered(frame, scene, rough, sought, memory, cues, s)
+    return _found(frame, scene, mask if block is None else mask & ~block, sure, rough, sought, memory, s)
+
+
+@dataclass(frozen=True, eq=False)
+class _Sought:
+    """Where the object is sought: what moved, what of that nothing beside it owns, and where it is expected."""
+
+    moved: Bool[Array, "h w"]
+    own: Bool[Array, "h w"]
+    expected: Bool[Array, "h w"]
+    near: Bool[Array, "h w"]
+
+
+def _at_color_time(
+    frame: RgbdFrame,
+    scene: StaticScene,
+    memory: Memory,
+    near: Bool[Array, "h w"],
+    block: Bool[Array, "h w"] | None,
+    s: BackgroundSettings,
+) -> tuple[RgbdFrame, BackgroundSettings, float]:
+    """The frame with its depth where colour shows the object, what then counts at the border, and how far (px) the
+    object went between the two exposures."""
+    way = way_px(frame, memory.speed_px_s)
+    far_px = float(np.linalg.norm(way))
+    if far_px <= s.late.least_px:
+        return frame, s, far_px
+    body = component_in(_moved_by_depth(frame, scene, block, s), shifted(near, -way))
+    frame = at_color_time(frame, scene, body, way, s.late, s.foreground)
+    return frame, replace(s, foreground=s.late.at_border(s.foreground)), far_px
+
+
+def _sought(
+    frame: RgbdFrame,
+    scene: StaticScene,
+    memory: Memory,
+    near: Bool[Array, "h w"],
+    reach: int,
+    block: Bool[Array, "h w"] | None,
+    cues: RobotCues | None,
+    s: BackgroundSettings,
+) -> _Sought:
+    moved = moved_pixels(frame, scene, s.foreground)
+    if (moved & ~scene.known).any():
+        moved &= scene.known | (memory.likeness.log_odds(frame.color_rgb) > 0)
     if block is not None:
-        mask = mask & ~block
-    ratio = min(mask.sum(), area) / max(mask.sum(), area, 1)
-    solid = moved & near & (frame.depth_m > 0)  # what only looks different may be the object's shadow
-    solid &= ~(grown(rough, 3) if own is moved else rough)
-    others = beside(frame, scene, solid, rough, s.foreground, s.least_px)
-    largest = _largest_other(frame, scene, moved & ~grown(mask, 9), s)
+        moved &= ~block
+    came_px = _best_shift(frame, moved, near, memory, cues, reach)
+    expected, own = shifted(memory.mask, came_px), moved
+    if memory.others is not None and cues is None:
+        shares = memory.likeness.object_shares
+        own = without_others(frame, scene, moved, expected, came_px, memory.others, shares, reach, s.foreground)
+    return _Sought(moved, own, expected, grown(expected, reach))
+
+
+def _bordered(
+    frame: RgbdFrame,
+    scene: StaticScene,
+    rough: Bool[Array, "h w"],
+    sought: _Sought,
+    memory: Memory,
+    cues: RobotCues | None,
+    s: BackgroundSettings,
+) -> tuple[Bool[Array, "h w"], float]:
+    """The rough mask with its border drawn anew, and how sure that is."""
+    if cues is not None:  # where the scene's colour is known, the robot's colours speak against the object only
+        odds = np.where(scene.known, np.minimum(cues.odds, 0), cues.odds)
+        return refine_border(frame, scene, rough, odds, s.foreground, s.piece_px)
+    odds = _likeness_near(frame, memory, rough)
+    odds[sought.moved & ~sought.own] = -MOST_ODDS
+    return refine_border(frame, scene, rough, odds, s.foreground)
+
+
+def _found(
+    frame: RgbdFrame,
+    scene: StaticScene,
+    mask: Bool[Array, "h w"],
+    sure: float,
+    rough: Bool[Array, "h w"],
+    sought: _Sought,
+    memory: Memory,
+    s: BackgroundSettings,
+) -> Found:
+    """The mask, less sure where its size changed, and what else there is."""
+    ratio = min(mask.sum(), memory.size_px) / max(mask.sum(), memory.size_px, 1)
+    solid = sought.moved & sought.near & (frame.depth_m > 0)  # what only looks different may be the object's shadow
+    solid &= ~(grown(rough, 3) if sought.own is sought.moved else rough)
+    others = things_near(frame, scene, solid, rough, s.foreground, s.least_px)
+    largest = largest_other(frame, scene, sought.moved & ~grown(mask, 9), s.foreground, s.least_px)
     return Found(mask, float(np.clip(sure * min(1.0, ratio / 0.7), 0, 1)), others, largest)
 
 
@@ -238,23 +297,6 @@ def _moved_by_depth(
     nearer = nearer_than_scene(frame.depth_m, scene, s.foreground)
     nearer = nearer if block is None else nearer & ~block
     return cv2.morphologyEx(nearer.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)) > 0
-
-
-def _largest_other(frame: RgbdFrame, scene: StaticScene, moved: Bool[Array, "h w"], s: BackgroundSettings) -> int:
-    """Size of the largest thing, away from the object, that is not scene: what looks as the scene always looked there
-    has not moved, however its depth flickers."""
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(moved.astype(np.uint8), connectivity=4)
-    order = 1 + np.argsort(-stats[1:count, cv2.CC_STAT_AREA])
-    for k in order:
-        if stats[k, cv2.CC_STAT_AREA] < s.least_px:
-            break
-        left, top, width, height = stats[k, :4]
-        at = np.s_[top : top + height, left : left + width]
-        thing = labels[at] == k
-        apart = np.abs(frame.color_rgb[at][thing] - scene.color_rgb[at][thing]).max(-1)
-        if (apart > np.maximum(s.foreground.color_step, 4 * scene.color_sigma[at][thing])).mean() > 0.5:
-            return int(stats[k, cv2.CC_STAT_AREA])
-    return 0
 
 
 def component_in(mask: Bool[Array, "h w"], region: Bool[Array, "h w"]) -> Bool[Array, "h w"]:

@@ -42,7 +42,7 @@ class ForegroundSettings:
     weight_sigma: float = 0.5
     """How fast it turns to either side, as a share of what it says, per standard deviation."""
     weight_likeness: float = 1.5
-    """Weight of the colour histograms, used where the scene's colour is unknown or other things touch the object."""
+    """Weight of the histograms of what the object and its surroundings showed in the frames before."""
     lit: float = 1.1
     """What lies in no shadow is at most this much brighter than the scene was. Shadows may be of any darkness."""
     unseen_px: float = 10.0

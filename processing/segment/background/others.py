@@ -46,7 +46,7 @@ class Others:
         return Others(mask, shares if before is None else MEMORY * before.shares + (1 - MEMORY) * shares)
 
 
-def beside(
+def things_near(
     frame: RgbdFrame,
     scene: StaticScene,
     solid: Bool[Array, "h w"],
@@ -105,6 +105,25 @@ def without_others(
     belief = smooth(odds, np.dstack([frame.color_rgb[at].astype(np.float32), depth]), s)
     out[at] = moved[at] & (belief > 0) & (expected[at] | ~scene_colored(frame, scene, at, s))
     return out
+
+
+def largest_other(
+    frame: RgbdFrame, scene: StaticScene, moved: Bool[Array, "h w"], s: ForegroundSettings, least_px: int
+) -> int:
+    """Size of the largest thing, away from the object, that is not scene: what looks as the scene always looked there
+    has not moved, however its depth flickers."""
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(moved.astype(np.uint8), connectivity=4)
+    order = 1 + np.argsort(-stats[1:count, cv2.CC_STAT_AREA])
+    for k in order:
+        if stats[k, cv2.CC_STAT_AREA] < least_px:
+            break
+        left, top, width, height = stats[k, :4]
+        at = np.s_[top : top + height, left : left + width]
+        thing = labels[at] == k
+        apart = np.abs(frame.color_rgb[at][thing] - scene.color_rgb[at][thing]).max(-1)
+        if (apart > np.maximum(s.color_step, 4 * scene.color_sigma[at][thing])).mean() > 0.5:
+            return int(stats[k, cv2.CC_STAT_AREA])
+    return 0
 
 
 def _away(mask: Bool[Array, "a b"]) -> Float[Array, "a b"]:

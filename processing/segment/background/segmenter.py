@@ -24,7 +24,7 @@ from processing.segment.background.follow import (
     remember,
 )
 from processing.segment.background.foreground import grown, moved_pixels, refine_border
-from processing.segment.background.others import beside
+from processing.segment.background.others import things_near
 from processing.segment.background.static_scene import (
     StaticScene,
     colorless,
@@ -130,8 +130,9 @@ class BackgroundSegmenter:
         position, what was found, and whether the frame is well lit."""
         first, s = self._leveled(frames[start])[0], self._settings
         scene = self._scene_without(first, seed.mask)
+        others = self._held(first, scene, seed.mask, None if robot is None else robot[start])
         for order in (range(start + 1, len(frames)), range(start - 1, -1, -1)):
-            memory = remember(None, first, replace(seed, others=self._held(first, scene, seed.mask)))
+            memory = remember(None, first, replace(seed, others=others))
             if self._detection is not None:
                 memory = replace(memory, likeness=memory.likeness.with_shares(self._detection.shares))
             for i in order:
@@ -143,14 +144,17 @@ class BackgroundSegmenter:
                 memory = remember(memory, frame, found, learn=lit and found.confidence > s.sure)
                 yield i, found, lit
 
-    def _held(self, frame: RgbdFrame, scene: StaticScene, mask: Bool[Array, "h w"]) -> Bool[Array, "h w"] | None:
+    def _held(
+        self, frame: RgbdFrame, scene: StaticScene, mask: Bool[Array, "h w"], robot: Bool[Array, "h w"] | None
+    ) -> Bool[Array, "h w"] | None:
         """What is neither scene nor a known robot and stands beside the object, as a hand does."""
         s = self._settings
         if self._drawn is not None:
             return None
         around = grown(mask, reach_px(float(mask.sum()), 1)) & ~mask
         solid = moved_pixels(frame, scene, s.foreground) & around
-        return beside(frame, scene, solid, mask, s.foreground, s.least_px)
+        solid = solid if robot is None else solid & ~robot
+        return things_near(frame, scene, solid, mask, s.foreground, s.least_px)
 
     def _redetected(
         self,
