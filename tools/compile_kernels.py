@@ -20,6 +20,7 @@ PROFILE = "processing.track.revolution.profile_kernels"
 AZIMUTH = "processing.track.revolution.azimuth_kernels"
 F8, F4, I8 = "float64", "float32", "int64"
 V, M, T, Q = f"{F8}[::1]", f"{F8}[:,::1]", f"{F8}[:,:,::1]", f"{F8}[:,:,:,::1]"
+T2 = "uint16[:,:,::1]"
 V4, M4, T4, Q4 = f"{F4}[::1]", f"{F4}[:,::1]", f"{F4}[:,:,::1]", f"{F4}[:,:,:,::1]"
 VI, MI, VB, MB = f"{I8}[::1]", f"{I8}[:,::1]", "boolean[::1]", "boolean[:,::1]"
 MOTION = (V, V, VB, V, V, V, F8, V)
@@ -46,7 +47,7 @@ KERNELS: dict[tuple[str, str], list[tuple[str, ...]]] = {
     ("processing.contact.physics.steps_cpu", "roll_rows"): [ROLL],
     ("processing.contact.physics.solver_cpu", "solve_rows"): [(T, M, F8, M, F8, I8, F8, I8)],
     ("processing.field.fuse", "_integrate"): [
-        (T4, T4, T4, T4, Q4, I8, V4, F4, F4, M4, M4, M4, T4, MB, "uint8[:,:,:]", MB)
+        (T4, T4, T4, T4, T2, T2, Q4, I8, V4, F4, F4, M4, M4, M4, T4, MB, MB, "uint8[:,:,:]", MB)
     ],
     ("processing.motion.se3_kernels", "exponential"): [(V,)],
     ("processing.motion.se3_kernels", "inverse"): [(M,)],

@@ -27,6 +27,12 @@ BEHIND_FULL = np.float32(0.3)
 """Cells further behind a surface than this share of the truncation count less and less: near an edge they belong to
 another face (weighed fully they bulge it out; weighed down from the surface on, noisy poses shrink the object)."""
 
+SEEN_BEHIND = 0.04
+"""A cell that depth calls inside is unseen all the same where fewer than this share of the views say so: near an edge
+it only lies behind another face, and its own was in view of none."""
+OFF_MASK = 0.2
+"""An unseen cell is empty where more than this share of the views sees it beside the mask."""
+
 
 @dataclass(frozen=True)
 class FuseConfig:
@@ -76,12 +82,13 @@ def fuse(views: Sequence[FieldView], config: FuseConfig, prior_shape: ObjectShap
     weight = np.zeros(shape, dtype=np.float32)
     passed = np.zeros(shape, dtype=np.float32)
     blocked = np.zeros(shape, dtype=np.float32)
+    masked, unmasked = np.zeros(shape, dtype=np.uint16), np.zeros(shape, dtype=np.uint16)
     paint = np.zeros((*shape, 4), dtype=np.float32)
 
     def integrate(part: slice) -> None:
         for view in views:
             _integrate(
-                *(total[part], weight[part], passed[part], blocked[part], paint[part]),
+                *(total[part], weight[part], passed[part], blocked[part], masked[part], unmasked[part], paint[part]),
                 part.start,
                 low.astype(np.float32),
                 np.float32(voxel_m),
@@ -91,12 +98,15 @@ def fuse(views: Sequence[FieldView], config: FuseConfig, prior_shape: ObjectShap
                 view.depth_m,
                 view.plane,
                 view.outside,
+                view.unmasked,
                 view.color_rgb,
                 view.inside if view.colorless is None else view.inside & ~view.colorless,
             )
 
     in_parts(integrate, shape[0], PART)
-    free = passed > np.maximum(2.0, 0.2 * blocked)
+    weight[(total < 0) & (blocked < SEEN_BEHIND * len(views))] = 0
+    passing = unmasked > np.maximum(2.0, OFF_MASK * (masked + unmasked.astype(np.float32)))
+    free = (passed > np.maximum(2.0, 0.2 * blocked)) | (passing & (weight == 0))
     sdf_m = np.where(weight > 0, total / np.maximum(weight, 1e-9), 0).astype(np.float32)
     rgb = paint[..., :3] / np.maximum(paint[..., 3:], 1e-9)
     grid = Grid(low, voxel_m, config.truncation_m, sdf_m, weight, free, rgb)
@@ -117,8 +127,9 @@ def _spread(rgb: Float32[Array, "a b c 3"], known: Bool[Array, "a b c"]) -> Floa
 @numba.njit(cache=True, nogil=True, fastmath=True)
 @no_type_check  # numba cannot cache what the tests' type checker wraps
 def _integrate(
-    total, weight, passed, blocked, paint, first, low, voxel, truncation, pose, K, depth, plane, outside, rgb, colored
-):
+    total, weight, passed, blocked, masked, unmasked, paint, first, low, voxel, truncation, pose, K, depth, plane,
+    outside, off_mask, rgb, colored,
+):  # fmt: skip
     """One view into the sums, which begin at layer `first` of the grid. Cells are walked along the last axis; all
     lengths in metres."""
     height, width = depth.shape
@@ -137,6 +148,10 @@ def _integrate(
                     v = int(np.floor(K[1, 1] * y / z + K[1, 2] + np.float32(0.5)))
                     if 0 <= u < width and 0 <= v < height:
                         d = depth[v, u]
+                        if off_mask[v, u]:
+                            unmasked[i, j, k] += 1
+                        else:
+                            masked[i, j, k] += 1
                         if d > 0:
                             p0, p1, p2 = plane[v, u, 0], plane[v, u, 1], plane[v, u, 2]
                             length = np.sqrt(p0 * p0 + p1 * p1 + p2 * p2)

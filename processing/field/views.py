@@ -25,7 +25,8 @@ class FieldView:
     """One masked RGBD view, undistorted and cropped. `K` belongs to the crop.
 
     `depth_m` is 0 where there is no trustworthy return on the object. `plane` is the local surface in camera
-    coordinates as n with n . X = 1 (fitted to inverse depth). `outside` marks rays that surely pass the object.
+    coordinates as n with n . X = 1 (fitted to inverse depth). `outside` marks rays that surely pass the object,
+    `unmasked` all that are not the mask's; neither where something may hide it.
     `camera_from_object` is the pose at the colour exposure, `camera_from_object_at_depth` at the depth exposure, to
     which colours and masks are moved: as a plane at the object's median depth moves.
     `colorless` marks pixels whose colour is not the object's (None: there are none).
@@ -37,6 +38,7 @@ class FieldView:
     plane: Float32[Array, "h w 3"]
     inside: Bool[Array, "h w"]
     outside: Bool[Array, "h w"]
+    unmasked: Bool[Array, "h w"]
     camera_from_object: Float[Array, "4 4"]
     camera_from_object_at_depth: Float[Array, "4 4"]
     colorless: Bool[Array, "h w"] | None = None
@@ -86,12 +88,13 @@ def make_view(
     K = camera.K.copy()
     K[0, 2] -= box[1].start
     K[1, 2] -= box[0].start
-    inside, outside = _erode(mask, EDGE_PX // 2), ~_dilate(mask, EDGE_PX)
+    inside, outside, unmasked = _erode(mask, EDGE_PX // 2), ~_dilate(mask, EDGE_PX), ~mask
     if hidden is not None:
-        outside &= ~_dilate(_remap(hidden.astype(np.uint8), maps, cv2.INTER_NEAREST)[box] > 0, EDGE_PX)
+        open_px = ~_dilate(_remap(hidden.astype(np.uint8), maps, cv2.INTER_NEAREST)[box] > 0, EDGE_PX)
+        outside, unmasked = outside & open_px, unmasked & open_px
     depth_m, plane = _trusted(np.where(inside, depth_m[box], 0).astype(np.float32), K)
     return FieldView(
-        K, color_rgb[box], depth_m, plane, inside, outside, camera_from_object, camera_from_object_at_depth,
+        K, color_rgb[box], depth_m, plane, inside, outside, unmasked, camera_from_object, camera_from_object_at_depth,
         None if foreign is None else foreign[box],
     )  # fmt: skip
 

@@ -14,7 +14,7 @@ from processing.run import Run
 from processing.store import Done
 from recordings.results.folder import read_track, write_shape
 
-VERSION = 4
+VERSION = 5
 
 
 @dataclass(frozen=True)

@@ -178,6 +178,12 @@ def test_foreign_colour_does_not_reach_the_shape(views):
     assert spread_deg(trained.views, views) < spread_deg(untouched.views, views) + 0.1
 
 
+def test_a_corner_that_depth_never_tells_of_grows_no_spike():
+    """What lies behind one face, and beside the mask wherever it would be seen, is empty."""
+    shape = grid_mesh(fuse(cube_views(60, noise_m=0.001), FuseConfig(truncation_m=0.005)))
+    assert distance_to_cube_m(shape.vertices_m).max() < 0.0015
+
+
 def test_the_same_seed_gives_the_same_field(views):
     config = FieldConfig(steps=5, rays=256)
     first, second = train_field(views[:8], config), train_field(views[:8], config)
