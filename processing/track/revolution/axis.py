@@ -111,3 +111,15 @@ def _surface(
         points.append((p - poses[i][:3, 3]) @ R)
         normals.append(n @ R)
     return np.concatenate(points), np.concatenate(normals)
+
+
+def angles_between(poses: Float[Array, "v 4 4"], others: Float[Array, "v 4 4"], axis: Axis) -> Float[Array, " v"]:
+    """The turn (rad) about the axis that leads from each pose to the other hypothesis's."""
+    out = np.zeros(len(poses))
+    for n, (p, o) in enumerate(zip(poses, others)):
+        if np.isfinite(o).all():
+            turn = p[:3, :3].T @ o[:3, :3]
+            d = axis.direction
+            sine = 0.5 * float(d @ [turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
+            out[n] = np.arctan2(sine, 0.5 * (float(np.trace(turn)) - float(d @ turn @ d)))
+    return out

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
-import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 from numpy import ndarray as Array
@@ -23,10 +22,10 @@ from processing.sensor.view import ViewStore
 from processing.track import kernels as k
 from processing.track.beam import Scene
 from processing.track.revolution import azimuth_kernels as tk
-from processing.track.revolution.axis import Axis, AxisConfig
+from processing.track.revolution.axis import Axis, AxisConfig, angles_between
 from processing.track.revolution.azimuth_smoothing import Normal, SteadyConfig, pace_of, steadied
 from processing.track.revolution.rolling import Grounded, grounded, sunk
-from processing.track.revolution.unwrapping import Unwrapped, UnwrappingConfig, unwrap
+from processing.track.revolution.unwrapping import Unwrapped, UnwrappingConfig, unwrap, usual_appearance
 from recordings.constants import MAD_TO_SIGMA_SHORT
 from recordings.robust import cauchy_weight
 
@@ -82,8 +81,11 @@ class AzimuthConfig:
     (a lamp's mirror images, shadows) and count the less ..."""
     left_share: float = 0.35
     """... or where it is more than this share of what random azimuths leave: then appearance is noise."""
+    standing_share: float = 0.7
+    """What stands off the body shows in most pairs: where random azimuths cost less than this share of `most_shape`, it
+    is seen in few views (a finger, depth that runs on to the table) and counts the less, by the third power."""
     trusted: float = 0.7
-    """An appearance that weighs less than this makes the search start again."""
+    """An appearance that would weigh less than this does; the search starts again."""
     spin_change_rad_s: float = 1.5
     """Usual change of spin from view to view, on the grid."""
     fast_rad_s: float = 25.0
@@ -99,6 +101,14 @@ class AzimuthConfig:
     """Inconsistency (nats a pair) that right poses leave; where more is left, the uncertainty grows with it."""
 
 
+@dataclass(frozen=True)
+class Trust:
+    """Weights, 0..1, of appearance and of what stands off the body."""
+
+    appearance: float = 1.0
+    shape: float = 1.0
+
+
 @dataclass(frozen=True, eq=False)
 class Azimuths:
     """Poses after the search, the standard deviation of each one's azimuth about the axis, and the axis."""
@@ -106,8 +116,7 @@ class Azimuths:
     poses: Float[Array, "n 4 4"]
     sigma_rad: Float[Array, " n"]
     axis: Axis
-    trust: float = 1.0
-    """Weight of appearance, 0..1."""
+    trust: Trust = Trust()
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,18 +158,17 @@ def estimate_azimuths(
         return Azimuths(poses, np.zeros(len(poses)), axis)
     poses = _stood(poses, frames, axis, first)
     step = 2 * np.pi / config.cells
-    appearance, shape, rest = _weighed(scene, poses, frames, axis, config)
+    appearance, shape, standing, rest = _weighed(scene, poses, frames, axis, config)
     starts = [np.zeros(len(frames.views), dtype=np.int64)]
-    starts += [np.round(_angles(poses[frames.views], r[frames.views], axis) / step).astype(np.int64) % config.cells
-               for r in rivals]  # fmt: skip
-    state, trust = _sought(_near(appearance, shape), rest, starts, config), 1.0
-    appearance_weight = _appearance_weight(appearance, frames.pairs, state, config)
-    if appearance_weight < config.trusted:
-        trust = appearance_weight
+    apart = [angles_between(poses[frames.views], r[frames.views], axis) for r in rivals]
+    starts += [np.round(a / step).astype(np.int64) % config.cells for a in apart]
+    state = _sought(_near(appearance, shape), rest, starts, config)
+    trust = _appearance_weight(appearance, frames.pairs, state, config)
+    if trust < 1.0:
         state = _sought(_near(trust * appearance, shape), rest, [*starts, state], config)
     out = _moved(poses, frames, state * step, axis, first)
     spread = _spread(frames, _near(trust * appearance, shape), rest, state, len(poses))
-    return steady(scene, Azimuths(out, spread, axis, trust), use, first, config)
+    return steady(scene, Azimuths(out, spread, axis, Trust(trust, standing)), use, first, config)
 
 
 def given_azimuths(
@@ -170,17 +178,18 @@ def given_azimuths(
     frames = _frames(scene, use, config)
     if len(frames.pairs) == 0:
         return Azimuths(poses, np.zeros(len(poses)), axis)
-    appearance, shape, rest = _weighed(scene, poses, frames, axis, config)
+    appearance, shape, standing, rest = _weighed(scene, poses, frames, axis, config)
     state = np.zeros(len(frames.views), dtype=np.int64)
-    appearance_weight = _appearance_weight(appearance, frames.pairs, state, config)
-    trust = appearance_weight if appearance_weight < config.trusted else 1.0
-    return Azimuths(poses, _spread(frames, _near(trust * appearance, shape), rest, state, len(poses)), axis, trust)
+    trust = _appearance_weight(appearance, frames.pairs, state, config)
+    spread = _spread(frames, _near(trust * appearance, shape), rest, state, len(poses))
+    return Azimuths(poses, spread, axis, Trust(trust, standing))
 
 
 def _weighed(
     scene: Scene, poses: Float[Array, "n 4 4"], frames: _Frames, axis: Axis, config: AzimuthConfig
-) -> tuple[Float[Array, "m c"], Float[Array, "m c"], tuple[object, ...]]:
-    """Cost of each pair for all azimuths between its views, by appearance and by shape, and what the search needs."""
+) -> tuple[Float[Array, "m c"], Float[Array, "m c"], float, tuple[object, ...]]:
+    """Cost of each pair for all azimuths between its views, by appearance and by shape, the weight of the latter (which
+    is in it), and what the search needs."""
     unwrapped = unwrap(scene, poses, frames.views, axis, config.cells, config.unwrapping)
     body = grounded(scene.store, frames.views, poses[frames.views], axis, unwrapped.rings)
     pace = pace_of(scene, poses, frames.runs, frames.views, body, config.steady)
@@ -190,11 +199,12 @@ def _weighed(
     appearance = np.minimum(np.maximum(_above_least(appearance) - config.pair_dead, 0.0), config.most_appearance)
     step = 2 * np.pi / config.cells
     shape = np.minimum(_above_least(shape), config.most_shape)
-    shape += _sunk(body, unwrapped, frames, step * np.arange(config.cells), config)
+    standing = min(float(shape.mean()) / (config.standing_share * config.most_shape), 1.0) ** 3
+    shape = standing * (shape + _sunk(body, unwrapped, frames, step * np.arange(config.cells), config))
     motion = np.array([config.spin_change_rad_s, config.fast_rad_s, config.fast_cost])
     expected = pace.expected.step_rad, pace.expected.sigma_rad
     rest = (frames.pairs, pace.base_rad, pace.steps_s, pace.still, pace.spin_weight, *expected, step, motion)
-    return appearance, shape, rest
+    return appearance, shape, standing, rest
 
 
 def _sunk(
@@ -219,8 +229,9 @@ def _appearance_weight(
     """Weight of appearance: 1 where it costs little at the found azimuths, and far less than at random ones."""
     costs = _near(appearance, np.zeros_like(appearance))
     left = costs[np.arange(len(costs)), (state[pairs[:, 0]] - state[pairs[:, 1]]) % config.cells].mean()
-    usual = min(config.left, max(config.left_share * costs.mean(), 1e-6))
-    return float(cauchy_weight((left / usual) ** 2))
+    usual = min(config.left, max(config.left_share * float(costs.mean()), 1e-6))
+    weight = float(cauchy_weight((left / usual) ** 2))
+    return weight if weight < config.trusted else 1.0
 
 
 def _near(appearance: Float[Array, "m c"], shape: Float[Array, "m c"]) -> Float[Array, "m c"]:
@@ -249,7 +260,8 @@ def steady(scene: Scene, found: Azimuths, use: Bool[Array, " n"], first: int, co
         unwrapped = unwrap(scene, poses, frames.views, found.axis, config.fine_cells, config.unwrapping)
         body = grounded(scene.store, frames.views, poses[frames.views], found.axis, unwrapped.rings)
         costs, cell_rad = _fine_costs(unwrapped, body, frames, found.trust, config)
-        standing = standing_terms(scene.store, poses[frames.views], frames, unwrapped.standing, found.axis, config)
+        H, g = standing_terms(scene.store, poses[frames.views], frames, unwrapped.standing, found.axis, config)
+        standing = found.trust.shape * H, found.trust.shape * g
         pace = pace_of(scene, poses, frames.runs, frames.views, body, config.steady)
         start = _run_of(frames.runs, first)
         angle, sigma = steadied(costs, frames.pairs, standing, pace, cell_rad, start, config.steady)
@@ -263,7 +275,7 @@ def _stood(poses: Float[Array, "n 4 4"], frames: _Frames, axis: Axis, first: int
     """Frames of one run turned as their view is; the first frame's pose stays, the others turn with its run."""
     angle = np.zeros(len(poses))
     for run, view in zip(frames.runs, frames.views):
-        angle[run] = _angles(poses[run], np.broadcast_to(poses[view], (len(run), 4, 4)), axis)
+        angle[run] = angles_between(poses[run], np.broadcast_to(poses[view], (len(run), 4, 4)), axis)
     return np.array([p @ axis.rotation(float(a - angle[first])) for p, a in zip(poses, angle)])
 
 
@@ -306,7 +318,7 @@ def standing_terms(
 
 
 def _fine_costs(
-    unwrapped: Unwrapped, body: Grounded, frames: _Frames, trust: float, config: AzimuthConfig
+    unwrapped: Unwrapped, body: Grounded, frames: _Frames, trust: Trust, config: AzimuthConfig
 ) -> tuple[Float[Array, "m d"], float]:
     """Cost of each pair for azimuths near those of the poses, in fine cells, and a cell's angle."""
     here = np.zeros(len(frames.views), dtype=np.int64)
@@ -317,7 +329,8 @@ def _fine_costs(
     shape = minimum_filter1d(np.minimum(shape, config.most_shape), 2 * config.slack + 1, axis=1, mode="nearest")
     cell_rad = 2 * np.pi / config.fine_cells
     azimuths_rad = cell_rad * np.arange(-config.fine_reach, config.fine_reach + 1)
-    return trust * appearance + shape + _sunk(body, unwrapped, frames, azimuths_rad, config), cell_rad
+    shape += _sunk(body, unwrapped, frames, azimuths_rad, config)
+    return trust.appearance * appearance + trust.shape * shape, cell_rad
 
 
 def _log_ratios(
@@ -326,7 +339,7 @@ def _log_ratios(
     """Costs by appearance, and log ratios by shape, of each pair's azimuths of -reach..reach cells."""
     appearance, shape = np.zeros((len(pairs), 2 * reach + 1)), np.zeros((len(pairs), 2 * reach + 1))
     sigma = np.maximum(config.wider * _differences(unwrapped, pairs, state, config), config.least_sigma)
-    usual = _usual(unwrapped, sigma)
+    usual = usual_appearance(unwrapped, sigma)
     seen, count = unwrapped.appearance, unwrapped.count
     tk.add_appearance_ratio(seen, count, usual, pairs, sigma, config.outlier, config.dead, reach, appearance)
     tk.add_shape_ratio(unwrapped.odd, unwrapped.sides, unwrapped.free, pairs, config.match, config.clash, reach, shape)
@@ -350,22 +363,6 @@ def _differences(
     return np.asarray(MAD_TO_SIGMA_SHORT / np.sqrt(2) * np.array(medians))
 
 
-def _usual(unwrapped: Unwrapped, sigma: Float[Array, "2"]) -> Float[Array, "v r c"]:
-    """Log density of each cell's appearance among all that its row shows: an azimuth only shuffles a row."""
-    out = np.zeros(unwrapped.count.shape)
-    for r in range(unwrapped.count.shape[1]):
-        use = unwrapped.count[:, r] > 0
-        if use.sum() < 5:
-            continue
-        seen = unwrapped.appearance[:, r][use]
-        at = np.clip(np.round((seen - np.median(seen, axis=0)) / sigma) + 30, 0, 60).astype(int)
-        shares = np.zeros((61, 61))
-        np.add.at(shares, (at[:, 0], at[:, 1]), 1.0 / len(at))
-        dense = 0.97 * cv2.GaussianBlur(shares, (0, 0), float(np.sqrt(2.0))) + 0.03 / shares.size
-        out[:, r][use] = np.log(dense[at[:, 0], at[:, 1]] / (sigma[0] * sigma[1]))
-    return out
-
-
 def _frames(scene: Scene, use: Bool[Array, " n"], config: AzimuthConfig) -> _Frames:
     runs: list[list[int]] = []
     for i in np.flatnonzero(use):
@@ -386,15 +383,3 @@ def _frames(scene: Scene, use: Bool[Array, " n"], config: AzimuthConfig) -> _Fra
 
 def _run_of(runs: list[list[int]], frame: int) -> int:
     return next((n for n, run in enumerate(runs) if frame in run), 0)
-
-
-def _angles(poses: Float[Array, "v 4 4"], others: Float[Array, "v 4 4"], axis: Axis) -> Float[Array, " v"]:
-    """The turn about the axis that leads from each pose to the other hypothesis's."""
-    out = np.zeros(len(poses))
-    for n, (p, o) in enumerate(zip(poses, others)):
-        if np.isfinite(o).all():
-            turn = p[:3, :3].T @ o[:3, :3]
-            d = axis.direction
-            sine = 0.5 * float(d @ [turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
-            out[n] = np.arctan2(sine, 0.5 * (float(np.trace(turn)) - float(d @ turn @ d)))
-    return out

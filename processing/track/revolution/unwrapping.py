@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 from numpy import ndarray as Array
@@ -42,12 +43,18 @@ class UnwrappingConfig:
     """Of the pixels, one in so many is used to fit the light."""
     robust: float = 1.5
     """Residuals of the light beyond so many standard deviations belong to the object."""
+    slow_deg: float = 30.0
+    slow_rows: int = 5
+    """A change of appearance over more than so many degrees and rows is the light's."""
     shine: float = 0.2
     """A surface whose brightness is beyond the light's by this share, and its colour paler, mirrors a lamp ..."""
     grey: float = 1.2
     """... unless it is paler than this share of the way to grey."""
     table_m: float = 0.006
-    """A place that lies deeper in the table is empty, and what is no higher above it may be the table."""
+    """A place that lies deeper in the table is empty, and what is no higher above it may be the table ..."""
+    window_px: float = 7.0
+    """... by a matcher's window more: depth runs on from the body to the table between them, and past its outline by
+    half a window (7 x 7 pixels: Keselman et al. 2017, as in sensor/noise.py)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,15 +119,46 @@ def unwrap(
         use = (row >= 0) & ~shines
         np.add.at(count[n], (row[use], cell[use]), 1)
         np.add.at(mean[n], (row[use], cell[use]), left[use])
-        height, layer, side, off = _off(p, profile, low, config)
+        window_m = float(config.window_px * scene.store.center_m[i][2] / scene.store.rectified.focal[0])
+        height, layer, side, off = _off(p, profile, low, window_m, config)
         np.add.at(odd[n], (side[off], layer[off] * heights + height[off], cell[off]), 1)
         free[n] = _free(scene, int(i), poses[i], axis, profile, low, cells, config)
         standing.append(p.samples[off])
     mean /= np.maximum(count, 1)[..., None]
+    mean = np.array([_without_slow_changes(m, c, config) for m, c in zip(mean, count)])
     anyhow = np.minimum(odd.sum(1), 3) / 3
     rings = np.column_stack([np.clip(low + (np.arange(heights) + 0.5) * config.row_m, low, high), profile])
     rings = np.concatenate([[[low, profile[0]]], rings, [[high, profile[-1]]]])
     return Unwrapped(mean, count, anyhow, np.minimum(odd, 3) / 3, free * (anyhow == 0), standing, rings)
+
+
+def _without_slow_changes(
+    mean: Float[Array, "r c 2"], count: Float[Array, "r c"], config: UnwrappingConfig
+) -> Float[Array, "r c 2"]:
+    """Appearance less its mean nearby: reflections of the table and shadows change slowly over a surface, what is
+    printed on it does not."""
+    wide = round(config.slow_deg / 360 * count.shape[1])
+    seen = (count > 0).astype(np.float64)[..., None]
+    padded = np.pad(np.concatenate([mean * seen, seen], -1), ((0, 0), (wide, wide), (0, 0)), "wrap")
+    window = 2 * wide + 1, config.slow_rows
+    around = cv2.boxFilter(padded, -1, window, normalize=False, borderType=cv2.BORDER_CONSTANT)[:, wide:-wide]
+    return np.where(seen > 0, mean - around[..., :2] / np.maximum(around[..., 2:], 1.0), 0.0)
+
+
+def usual_appearance(unwrapped: Unwrapped, sigma: Float[Array, "2"]) -> Float[Array, "v r c"]:
+    """Log density of each cell's appearance among all that its row shows: an azimuth only shuffles a row."""
+    out = np.zeros(unwrapped.count.shape)
+    for r in range(unwrapped.count.shape[1]):
+        use = unwrapped.count[:, r] > 0
+        if use.sum() < 5:
+            continue
+        seen = unwrapped.appearance[:, r][use]
+        at = np.clip(np.round((seen - np.median(seen, axis=0)) / sigma) + 30, 0, 60).astype(int)
+        shares = np.zeros((61, 61))
+        np.add.at(shares, (at[:, 0], at[:, 1]), 1.0 / len(at))
+        dense = 0.97 * cv2.GaussianBlur(shares, (0, 0), float(np.sqrt(2.0))) + 0.03 / shares.size
+        out[:, r][use] = np.log(dense[at[:, 0], at[:, 1]] / (sigma[0] * sigma[1]))
+    return out
 
 
 def across(axis: Axis) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
@@ -237,7 +275,7 @@ def _rows(
 
 
 def _off(
-    p: _Pixels, profile: Float[Array, " h"], low: float, config: UnwrappingConfig
+    p: _Pixels, profile: Float[Array, " h"], low: float, window_m: float, config: UnwrappingConfig
 ) -> tuple[Int[Array, " p"], Int[Array, " p"], Int[Array, " p"], Bool[Array, " p"]]:
     """Height, layer and seen side (0, 1, 2) of each pixel, and whether it stands off the round body."""
     height = np.floor((p.along_m - low) / config.row_m).astype(int)
@@ -246,8 +284,8 @@ def _off(
     above = p.radius_m - profile[height]
     step = config.layers_m[1] - config.layers_m[0]
     layer = np.clip(np.round((above - config.layers_m[0]) / step).astype(int), 0, len(config.layers_m) - 1)
-    off = known & (above > config.odd_m) & (above < config.layers_m[-1] + 2 * step) & (p.facing > 0.15)
-    off &= p.height_m > config.table_m
+    off = known & (above > max(config.odd_m, 0.5 * window_m)) & (above < config.layers_m[-1] + 2 * step)
+    off &= (p.facing > 0.15) & (p.height_m > config.table_m + window_m)
     side = np.where(p.normal[:, 2] > 0.35, 0, np.where(p.normal[:, 2] < -0.35, 2, 1))
     return height, layer, side, off
 

@@ -20,13 +20,21 @@ from processing.track.revolution.azimuth import (
     _appearance_weight,
     _Frames,
     _stood,
-    _usual,
     standing_terms,
     with_uncertainty,
 )
 from processing.track.revolution.azimuth_smoothing import Pace, SteadyConfig, steadied
 from processing.track.revolution.rolling import ExpectedSteps
-from processing.track.revolution.unwrapping import Unwrapped, UnwrappingConfig, _heights, _off, _Pixels, _shines
+from processing.track.revolution.unwrapping import (
+    Unwrapped,
+    UnwrappingConfig,
+    _heights,
+    _off,
+    _Pixels,
+    _shines,
+    _without_slow_changes,
+    usual_appearance,
+)
 from recordings.geometry import CameraModel, rotation_exp
 
 CAMERA = CameraModel("d455", 640, 480, np.array([[386.0, 0, 320], [0, 386, 240], [0, 0, 1]]))
@@ -175,7 +183,7 @@ def test_appearance_of_one_colour_leaves_the_azimuth_open_and_a_label_fixes_it()
             appearance, count, np.zeros((2, 1, 60)), np.zeros((2, 3, 1, 60)), np.zeros((2, 1, 60)), [], np.zeros((0, 2))
         )
         out[:] = 0
-        tk.add_appearance_ratio(appearance, count, _usual(unwrapped, sigma), pairs, sigma, 0.1, 0.5, 30, out)
+        tk.add_appearance_ratio(appearance, count, usual_appearance(unwrapped, sigma), pairs, sigma, 0.1, 0.5, 30, out)
         return out[0]
 
     assert np.ptp(said()) < 1.0
@@ -221,8 +229,25 @@ def test_the_table_seen_through_a_handle_stands_not_off_the_body() -> None:
     aside = np.tile([0.0, 1.0, 0.0], (n, 1))
     p = _Pixels(np.full(n, 0.02), np.full(n, 0.055), np.zeros(n), aside, np.ones(n), aside, np.zeros((n, 2)),
                 np.zeros(n), heights_m, np.zeros((n, lay.SAMPLE), np.float32))  # fmt: skip
-    *_, off = _off(p, np.full(20, 0.04), 0.0, UnwrappingConfig())
+    *_, off = _off(p, np.full(20, 0.04), 0.0, 0.0, UnwrappingConfig())
     assert off.tolist() == [False, False, True, True, True]
+    *_, off = _off(p, np.full(20, 0.04), 0.0, 0.02, UnwrappingConfig())  # a matcher's window joins body and table
+    assert off.tolist() == [False, False, False, True, True]
+    *_, off = _off(p, np.full(20, 0.04), 0.0, 0.036, UnwrappingConfig())  # and runs past the outline by half of it
+    assert not off.any()
+
+
+def test_what_changes_slowly_round_the_body_is_light_and_what_is_printed_stays() -> None:
+    cells, rows = 120, 12
+    angle = np.arange(cells) / cells * 2 * np.pi
+    count = np.zeros((rows, cells))
+    count[:, 20:90] = 2.0
+    mean = np.tile(0.3 * np.cos(angle)[None, :, None], (rows, 1, 2))
+    mean[4:8, 50:55, 0] += 0.4  # a label 15 degrees wide
+    left = _without_slow_changes(mean, count, UnwrappingConfig())
+    assert (left[count == 0] == 0).all()
+    assert np.abs(left[:, 35:75, 1]).max() < 0.03
+    assert left[5:7, 51:54, 0].min() > 0.25
 
 
 def test_frames_between_which_the_body_stands_still_turn_together() -> None:
