@@ -224,7 +224,7 @@ def test_an_error_in_one_toss_is_raised_once_and_the_others_stages_are_kept(
 
 
 LONG_RUN = """
-import os, sys, time
+import os, signal, sys, time
 from pathlib import Path
 from processing.engine.each import SideBySide
 from processing.engine.workers import Worker
@@ -232,6 +232,7 @@ from processing.store import Store
 from recordings.progress import Board
 
 def main():
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored where the tests run in a shell's background
     board, out = Board(), Path(sys.argv[1])
     with SideBySide([Worker(board), Worker(board)], board) as engine:
         store = Store(out / "results", engine)
