@@ -50,7 +50,8 @@ class FuseConfig:
 class Grid:
     """A signed-distance grid in the object frame: `sdf_m[i, j, k]` at `origin_m + voxel_m * (i, j, k)`.
 
-    `weight` is 0 where no view saw a surface or free space; `free` marks cells that some ray passed through;
+    `weight` is 0 where too few views saw a surface or free space; `free` marks cells that rays passed through, or that
+    lie beside the masks where no depth tells;
     `rgb` (0..1) is the mean colour of the surface nearest to a cell, 0 where nothing was seen near it.
     """
 
@@ -105,8 +106,8 @@ def fuse(views: Sequence[FieldView], config: FuseConfig, prior_shape: ObjectShap
 
     in_parts(integrate, shape[0], PART)
     weight[(total < 0) & (blocked < SEEN_BEHIND * len(views))] = 0
-    passing = unmasked > np.maximum(2.0, OFF_MASK * (masked + unmasked.astype(np.float32)))
-    free = (passed > np.maximum(2.0, 0.2 * blocked)) | (passing & (weight == 0))
+    off_masks = unmasked > np.maximum(2.0, OFF_MASK * (masked + unmasked.astype(np.float32)))
+    free = (passed > np.maximum(2.0, 0.2 * blocked)) | (off_masks & (weight == 0))
     sdf_m = np.where(weight > 0, total / np.maximum(weight, 1e-9), 0).astype(np.float32)
     rgb = paint[..., :3] / np.maximum(paint[..., 3:], 1e-9)
     grid = Grid(low, voxel_m, config.truncation_m, sdf_m, weight, free, rgb)
