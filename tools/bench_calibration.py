@@ -129,10 +129,10 @@ def usual_corners(board: Chessboard, images: Images, views: Sequence[TargetView]
     return out
 
 
-def opencv_lens(name: str, size: tuple[int, int], views: Sequence[TargetView]) -> CameraModel:
-    """cv2.calibrateCamera as it is: Brown's five numbers, plain least squares."""
+def opencv_lens(name: str, size: tuple[int, int], views: Sequence[TargetView], flags: int = 0) -> CameraModel:
+    """cv2.calibrateCamera as it is: Brown's five numbers (less by `flags`), plain least squares."""
     points, pixels = ([getattr(v, part).astype(np.float32) for v in views] for part in ("points_m", "pixels"))
-    _, matrix, bend, *_ = cv2.calibrateCamera(points, pixels, size, None, None)
+    _, matrix, bend, *_ = cv2.calibrateCamera(points, pixels, size, None, None, flags=flags)
     return CameraModel(name, *size, matrix, "brown-conrady", tuple(bend.ravel().tolist()))
 
 
@@ -197,7 +197,11 @@ def against(real: RealSet, lens: Lens, size: tuple[int, int], views: Sequence[Ta
     left = {v: float(q.mean()) for v, q in squares_aside(known, views, range(len(views))).items()}
     off = 100 * (lens.model.fx / known.fx - 1)
     held = abs(off) < max(0.3, 2 * lens.report.uncertainty["focal_percent"])
-    return f"; published {known.fx:.2f} (leaves {rms(left):.4f}): {off:+.2f} % {'held' if held else 'NOT HELD'}"
+    text = f"; published {known.fx:.2f} (leaves {rms(left):.4f}): {off:+.2f} % {'held' if held else 'NOT HELD'}"
+    if not any(real.published[5:]):  # one number of distortion, or none: its own model, fitted to these views
+        same = opencv_lens("color", size, views, cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST)
+        text += f", with the published lens's own model {same.fx:.2f} ({100 * (same.fx / known.fx - 1):+.2f} %)"
+    return text
 
 
 def published_lens(real: RealSet, size: tuple[int, int]) -> CameraModel:

@@ -8,7 +8,7 @@ only the board's pose is found. (Its marks free as well, a real bent board expla
 the focal length moves by .5 %: nothing but the board tells which is right, so that step counts into the deviation.)
 Brown's lens without k3 is the standard: k3, which cv2.calibrateCamera fits always, is told by one of eleven real sets,
 and where it is not, it may put a corner that no view reached pixels off. Fewer numbers are taken where they do as well
-on views kept aside, more where they do better beyond chance. A lens whose numbers the image circle does not support is
+on views kept aside, more where they do better by a standard error. A lens whose numbers the image circle does not support is
 refused. Figures on real boards: tools/bench_calibration.py.
 """
 
@@ -24,7 +24,7 @@ from numpy import ndarray as Array
 
 from calibration.cameras.bundle import Solved
 from calibration.cameras.extrinsics import AS_GOOD, LEAST_POINTS, PRINT_M, judge_print
-from calibration.cameras.lens_fit import CHANCE, LEAST_VIEWS, Fit, gain_by_chance, solve_lens, squares_aside
+from calibration.cameras.lens_fit import LEAST_VIEWS, STANDARD_ERRORS, Fit, gain_by_chance, solve_lens, squares_aside
 from calibration.cameras.lens_forms import WITHOUT_K3, LensForm
 from calibration.cameras.lens_support import unsupported
 from calibration.cameras.projection_derivatives import lens_numbers, with_lens
@@ -184,13 +184,13 @@ def _forms(kind: DistortionModel) -> tuple[LensForm, ...]:
 
 def _chosen(fits: Mapping[LensForm, Fit]) -> LensForm:
     """Of the lenses that their image circles support (of all where none is): the standard one, where one with fewer
-    numbers does not do as well on views kept aside, and none with more does better beyond chance."""
+    numbers does not do as well on views kept aside, and none with more does better by a standard error."""
     fine = {form: f for form, f in fits.items() if _unsupported(f) is None} or fits
     order = sorted(fine, key=lambda form: form.coefficients)
     taken = STANDARD if STANDARD in fine else order[0]
     for form in order:
         gain = gain_by_chance(fine[form].aside_px2, fine[taken].aside_px2)
-        wanted = 0.0 if form.coefficients < taken.coefficients else CHANCE
+        wanted = 0.0 if form.coefficients < taken.coefficients else STANDARD_ERRORS
         if form != taken and gain > wanted:
             taken = form
     return taken

@@ -17,8 +17,9 @@ from recordings.geometry import CameraModel
 
 LEAST_VIEWS = 5
 FOLDS = 4
-CHANCE = 2.0
-"""A difference on views kept aside is more than chance from as many standard errors on."""
+STANDARD_ERRORS = 1.0
+"""A lens with more numbers is taken where it leaves so many standard errors less of views kept aside (the
+one-standard-error rule: Breiman et al., Classification and Regression Trees, 1984, section 3.4.3)."""
 
 
 @dataclass(frozen=True, eq=False)

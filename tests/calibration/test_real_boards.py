@@ -63,6 +63,19 @@ def test_the_one_view_that_reaches_a_corner_is_explained_where_plain_opencv_is_o
 
 
 @pytest.mark.slow
+def test_a_real_lens_that_needs_k3_gets_it_from_a_dozen_views():
+    """On the three views aside, Brown's without k3 leaves more than twice what OpenCV's five numbers leave."""
+    images, size = pictures("MaartenJongeneel/Paper-Tracking/calibratecam/intrinsics/chessboard-*.jpg", 15), (1280, 720)
+    views = find_target(Chessboard(14, 9, 0.05), images)
+    lens = calibrate_intrinsics("color", size, views[3:], ("none", "brown-conrady")).model
+    ours, plain = (
+        float(np.concatenate([*squares_aside(model, views, [0, 1, 2]).values()]).mean() ** 0.5)
+        for model in (lens, opencv_lens(views[3:], size))
+    )
+    assert ours < 1.05 * plain
+
+
+@pytest.mark.slow
 def test_two_real_cameras_solved_with_their_lenses_are_turned_as_published():
     views = {"mono0": barry("left"), "mono1": barry("right")}
     lenses = {n: calibrate_intrinsics(n, (640, 512), v, ("none", "brown-conrady")).model for n, v in views.items()}
