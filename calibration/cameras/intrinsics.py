@@ -8,8 +8,8 @@ only the board's pose is found. (Its marks free as well, a real bent board expla
 the focal length moves by .5 %: nothing but the board tells which is right, so that step counts into the deviation.)
 Brown's lens without k3 is the standard: k3, which cv2.calibrateCamera fits always, is told by one of eleven real sets,
 and where it is not, it may put a corner that no view reached pixels off. Fewer numbers are taken where they do as well
-on views kept aside, more where they do better by a standard error. A lens whose numbers the image circle does not support is
-refused. Figures on real boards: tools/bench_calibration.py.
+on views kept aside, more where they do better by a standard error. A lens whose numbers the image circle does not
+support is refused. Figures on real boards: tools/bench_calibration.py.
 """
 
 from __future__ import annotations
