@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 from numpy import ndarray as Array
 
+from processing.segment.background.color_ratio import ColorSettings, color_log_ratio
 from processing.segment.background.static_scene import StaticScene
 from processing.sensor.noise import stereo_sigma_m
 from recordings.geometry import CameraModel
@@ -31,10 +32,6 @@ class ForegroundSettings:
     """The same in standard deviations of the depth."""
     color_step: float = 20.0
     """The least difference of colour from the scene that counts."""
-    color_share: float = 0.4
-    """The same as a share of the object's typical difference nearby: a blurred edge lies where it halves."""
-    weight_color: float = 2.0
-    """The most that colour says of a pixel: less, where the object nearby looks like the scene around it (`votes`)."""
     weight_depth: float = 1.5
     """The most that depth says: less, where beside this object returns that are not its own say the same."""
     middle_sigmas: float = 3.0
@@ -46,7 +43,8 @@ class ForegroundSettings:
     lit: float = 1.1
     """What lies in no shadow is at most this much brighter than the scene was. Shadows may be of any darkness."""
     unseen_px: float = 10.0
-    """So many pixels that nobody saw, of all kinds alike, temper what few pixels show."""
+    """So many pixels that nobody saw, of all kinds alike, temper what depth shows of few."""
+    color: ColorSettings = field(default_factory=ColorSettings)
     ring_px: int = 8
     """Width of the ring around the border's band that shows the scene, its shadows included."""
     smoothing: float = 1.2
@@ -124,55 +122,24 @@ def pixel_log_odds(
 ) -> Float32[Array, "a b"]:
     """Log-odds that a pixel of the window is the object, from its colour and its depth against the scene's.
 
-    A pixel has another hue than the scene, the scene's colour in a shadow, or the scene's colour; it lies before the
-    scene, at it, or gives no return. What each of these is worth, the frame itself tells: how often it is seen well
-    inside of the object, and how often around it. `likeness` (log-odds of the object's colours) stands in for the
-    scene's colour where that is not known.
+    A pixel lies before the scene, at it, or gives no return; what each of these is worth, the frame itself tells: how
+    often it is seen well inside of the object, and how often around it. `likeness` (log-odds of the object's colours)
+    stands in for the scene's colour where that is not known.
     """
     color, depth, part = frame.color_rgb[at].astype(np.float32), frame.depth_m[at], _cut(scene, at)
     solid = rough[at].astype(np.uint8)
     core, band = cv2.erode(solid, kernel(s.band_inside_px)) > 0, cv2.dilate(solid, kernel(s.band_outside_px)) > 0
     nearer = nearer_than_scene(depth, part, s)
-    ring = (cv2.dilate(band.astype(np.uint8), kernel(s.ring_px)) > 0) & ~band & ~nearer
-    by_color, like_scene = _color_votes(color, part, core, ring & part.known, s)
+    noise = s.color_step + 3 * part.color_sigma
+    scenic = part.known & ~nearer & (shadow_distance(color, part.color_rgb, s.lit) <= noise)
+    ring = (cv2.dilate(band.astype(np.uint8), kernel(s.ring_px)) > 0) & ~band & scenic
+    around_px = 4 * s.band_inside_px + 1
+    by_color = color_log_ratio(color, part.color_rgb, part.color_sigma, core, ring, around_px, s.color) * part.known
+    like_scene = part.known & (np.linalg.norm(color - part.color_rgb, axis=-1) <= noise)
     total = by_color + _depth_votes(depth, nearer, part, core, band & ~core, like_scene, s)
     if likeness is not None:
         total = total + s.weight_likeness * likeness
     return total.astype(np.float32)
-
-
-def _color_votes(
-    color: Float32[Array, "a b 3"], scene: StaticScene, core: Bool[Array, "a b"], ring: Bool[Array, "a b"],
-    s: ForegroundSettings,
-) -> tuple[Float32[Array, "a b"], Bool[Array, "a b"]]:  # fmt: skip
-    """What colour says of each pixel, and which pixels have the scene's own colour."""
-    plain = np.linalg.norm(color - scene.color_rgb, axis=-1)
-    hue = shadow_distance(color, scene.color_rgb, s.lit)
-    noise = s.color_step + 3 * scene.color_sigma
-    around_px = 4 * s.band_inside_px + 1
-    weight = np.maximum(_nearby(core, around_px), 1e-3)
-    at_hue, at_plain = (np.maximum(noise, s.color_share * _nearby(d * core, around_px) / weight) for d in (hue, plain))
-    other, like = hue > at_hue, plain <= at_plain
-    out = np.zeros_like(plain)
-    for kind in (other, ~other & ~like, ~other & like):
-        # the object's border may show any of its colours, and most likely those nearby
-        anywhere = (float((kind & core).sum()) + s.unseen_px / 3) / (float(core.sum()) + s.unseen_px)
-        around = (_nearby(kind & core, around_px) + s.unseen_px * anywhere) / (_nearby(core, around_px) + s.unseen_px)
-        inside = np.maximum(anywhere, around)
-        outside = (_nearby(kind & ring, around_px) + s.unseen_px / 3) / (_nearby(ring, around_px) + s.unseen_px)
-        out = np.where(kind, np.log(inside / outside).clip(-s.weight_color, s.weight_color), out)
-    sure = np.where(other, _sure(hue, at_hue), np.where(like, _sure(plain, at_plain), 1.0))
-    return (out * sure * scene.known).astype(np.float32), scene.known & like & ~other
-
-
-def _nearby(values: Array, size_px: int) -> Float32[Array, "a b"]:
-    """The sum over a square around each pixel."""
-    return np.asarray(cv2.boxFilter(values.astype(np.float32), -1, (size_px, size_px), normalize=False))
-
-
-def _sure(distance: Float32[Array, "a b"], least: Float32[Array, "a b"]) -> Float32[Array, "a b"]:
-    """1 where a distance is clearly on either side of a threshold."""
-    return np.clip(np.abs(distance - least) / (0.3 * least), 0.2, 1.0)
 
 
 def _depth_votes(

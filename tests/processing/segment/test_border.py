@@ -107,3 +107,21 @@ def test_depth_that_flickers_where_the_scene_looks_as_ever_is_nothing_that_moves
         BackgroundSettings(),
     )  # fmt: skip
     assert (found.largest_other_px > 500) == painted
+
+
+def striped_wood(scene: StaticScene) -> StaticScene:
+    """Grain whose dark and light stripes lie as far from each other as from a brown object."""
+    across = np.sin(np.arange(SIZE[1]) / 2.5).astype(np.float32)[None, :, None]
+    return replace(
+        scene, color_rgb=np.broadcast_to(np.array(WOOD) * (1 + 0.09 * across), (*SIZE, 3)).astype(np.float32)
+    )
+
+
+@pytest.mark.parametrize("fattened_px", [3, 5])
+def test_a_brown_object_on_brown_grain_has_its_own_border(fattened_px: int) -> None:
+    """Its colour is within 30 of the scene's at every pixel: what counts is that the scene is known pixel by pixel, and
+    the object by its inside."""
+    scene = striped_wood(wooden_table())
+    frame = picture(scene, (175.0, 130.0, 84.0), fattened_px, None)
+    found, _ = refine_border(frame, scene, grown(body(), 4), None, SETTINGS)
+    assert overlap(found) > 0.9

@@ -18,9 +18,9 @@ from recordings.view.layers import TIME
 from recordings.view.viewer import LOOPBACK, Viewer, ViewerFailed
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def viewer():
-    """A viewer without a window; skipped where there is no graphics driver."""
+    """A viewer without a window; skipped where there is no graphics driver. Idle, it still draws: 40 % of a core."""
     try:
         running = Viewer(headless=True, size=(800, 500)).__enter__()
     except ViewerFailed as missing:
