@@ -32,6 +32,7 @@ PIPE_BYTES = 1 << 20
 KEPT_BYTES = 1 << 22
 LEAVE_S = 0.5
 STOP_S = 1.5
+LAST_WORDS_S = 1.0
 
 
 class Worker:
@@ -58,10 +59,10 @@ class Worker:
             stderr=subprocess.PIPE,
             cwd=Path(__file__).resolve().parents[3],
         )
-        threads = [threading.Thread(target=run, daemon=True) for run in (self._collect_errors, self._receive)]
-        for thread in threads:
-            thread.start()
-        self._threads = threads
+        self._errors_reader = threading.Thread(target=self._collect_errors, daemon=True)
+        self._frames_reader = threading.Thread(target=self._receive, daemon=True)
+        self._errors_reader.start()
+        self._frames_reader.start()
 
     def send(self, message: dict[str, Any], blob: bytes = b"") -> None:
         """A command, and the bytes that belong to it. Raises DeviceLost when the child is gone."""
@@ -85,7 +86,7 @@ class Worker:
         except subprocess.TimeoutExpired:
             self._child.kill()
             self._child.wait()
-        for thread in self._threads:
+        for thread in (self._errors_reader, self._frames_reader):
             thread.join(0.2)
         for pipe in (self._child.stdin, self._child.stdout, self._child.stderr):
             if pipe is not None:
@@ -102,6 +103,7 @@ class Worker:
             self._on_frame(kind, pipe.read(size))
         if not self._stopping:
             self._child.wait()
+            self._errors_reader.join(LAST_WORDS_S)  # what it said last may still be in the pipe
             self._on_end(self._last_words())
 
     def _collect_errors(self) -> None:
