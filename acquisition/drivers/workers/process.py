@@ -20,6 +20,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
+from io import TextIOWrapper
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -125,6 +126,8 @@ class WorkerEnd:
     def __init__(self) -> None:
         self._out = os.dup(1)
         os.dup2(2, 1)  # whatever the vendor's library prints must not meet the frames
+        if isinstance(sys.stdout, TextIOWrapper):
+            sys.stdout.reconfigure(line_buffering=True)  # nor come after the error that the child ends by
         os.set_blocking(self._out, False)
         if hasattr(fcntl, "F_SETPIPE_SZ"):
             fcntl.fcntl(self._out, fcntl.F_SETPIPE_SZ, PIPE_BYTES)

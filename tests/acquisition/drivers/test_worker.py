@@ -42,6 +42,7 @@ class Driver:
     def __init__(self, monkeypatch: pytest.MonkeyPatch, folder: Path, frames: int, busy_s: float = 0.0) -> None:
         (folder / "child_of_test.py").write_text(CHILD)
         monkeypatch.setenv("PYTHONPATH", str(folder))
+        monkeypatch.delenv("PYTHONUNBUFFERED", raising=False)
         self.numbers: list[int] = []
         self.events: list[dict[str, object]] = []
         self.ended = threading.Event()
