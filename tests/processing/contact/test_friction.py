@@ -106,6 +106,18 @@ def test_a_sliding_box_slows_down_by_friction_times_gravity(rigid_box):
     assert pushed[0] == pytest.approx(GRAVITY_M_S2 * 120 / 592 * (1 + 0.2**2) ** 0.5, rel=0.02)
 
 
+@pytest.mark.parametrize("restitution", [0.0, 0.5])
+def test_a_plate_that_strikes_at_a_slant_leaves_by_coulombs_law(restitution):
+    """v_z+ = -e v_z-, and the push along the plane is friction times the push across it; sliding lifts nothing."""
+    plate = np.array([[x, y, z] for x in (-0.1, 0.1) for y in (-0.1, 0.1) for z in (-0.005, 0.005)])
+    state = [np.eye(3)[None].copy(), np.array([[0.0, 0.0, 0.005]]), np.zeros((1, 3)), np.array([[2.0, 0.0, -1.0]])]
+    inertia = np.diag([1.2e-3, 1.2e-3, 2.5e-3])
+    laws, owner = np.array([[0.3, restitution]]), np.zeros(1, dtype=int)
+    roll_rows(*state, owner, laws, plate, inertia, 0.37, 4, 1, 1 / 592)
+    fall = 1.0 + GRAVITY_M_S2 / 592
+    assert state[3][0] == pytest.approx([2.0 - 0.3 * (1 + restitution) * fall, 0.0, restitution * fall], abs=5e-3)
+
+
 def test_in_flight_no_friction_forecasts_better_than_another(rigid_box):
     """And the score is that of a forecast as wide as the truth: a mean distance less half the members' own."""
     rng, time_s = np.random.default_rng(0), np.arange(9) / 30
