@@ -15,7 +15,7 @@ from acquisition.streaming.recorder import Recorder
 from acquisition.synthetic.lab_config import SyntheticConfig
 from recordings.progress import Silent
 from recordings.view.live import LiveView
-from recordings.view.viewer import ViewerFailed
+from recordings.view.viewer import NoGraphics, ViewerFailed
 
 
 @pytest.mark.slow
@@ -27,7 +27,10 @@ def test_a_picture_of_every_stream_is_in_the_viewer(tmp_path: Path) -> None:
     recorder = Recorder(Rig("r", entries, Path("r.toml")), devices, SessionClock(time.monotonic_ns(), time.time_ns()))
     with recorder, Preview(recorder, headless=True) as preview:
         time.sleep(2.0)
-        picture = preview.picture()
+        try:
+            picture = preview.picture()
+        except NoGraphics as fault:
+            pytest.skip(str(fault))
     (tmp_path / "preview.png").write_bytes(picture)
     assert picture.startswith(b"\x89PNG")
     assert len(picture) > 20_000  # an empty window is smaller

@@ -108,7 +108,7 @@ def test_a_folder_in_the_way_is_said(session, tmp_path, capsys):
 LIMITED = """
 import resource, signal, sys
 from recordings.cli_view import main
-from recordings import view  # what Python caches on import is not what is tested
+sys.dont_write_bytecode = True  # what Python caches on import is not what is tested
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, ({size}, {size}))
 sys.exit(main([{session!r}, "--save", {out!r}]))
