@@ -22,7 +22,6 @@ from processing.contact.learn.prepared import no_contact, none_usable
 from processing.contact.learn.prior import Prior, prior_from_shape, prior_from_size
 from processing.contact.physics.inertia import Physics, physics_of_session, uniform_box_physics, uniform_physics
 from processing.contact.physics.plane import Plane, calibrated_plane
-from processing.contact.physics.support import CAP_M2
 from processing.contact.report.assets import write_assets
 from processing.contact.report.figure import draw_result
 from processing.contact.report.result import result_document, result_text, warnings_of
@@ -42,7 +41,7 @@ from recordings.whole_file import write_json
 if TYPE_CHECKING:
     from recordings.session import Session
 
-VERSION = 5
+VERSION = 6
 STEP_S = 1 / 148
 
 
@@ -289,7 +288,7 @@ def make_prior(
     rests."""
     if source.shape is not None and init_m is None:
         physics = shape_physics(source.shape, given)
-        return prior_from_shape("box", source.shape, physics, cap_m2=CAP_M2), physics
+        return prior_from_shape("box", source.shape, physics, trimmed=True), physics
     side = resting_side_m(tracks, plane) if init_m is None else init_m
     physics = given or uniform_box_physics(np.full(3, side))
     prior = prior_from_size(geometry or "box", side, physics.center_of_mass_m)  # type: ignore[arg-type]

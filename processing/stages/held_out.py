@@ -26,7 +26,7 @@ from recordings.whole_file import write_json
 if TYPE_CHECKING:
     from processing.contact.learn.shape_comparison import TossLoss
 
-VERSION = 4
+VERSION = 5
 LEAST_TOSSES = 4
 """From which on there are halves: learned from fewer than two tosses, friction is hardly known."""
 ALONE = "passes are compared by images alone, not by the contact of tosses held out"

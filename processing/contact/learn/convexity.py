@@ -20,7 +20,7 @@ from processing.contact.physics.geometry import SCALE_M
 from processing.contact.physics.inertia import Physics
 from processing.contact.physics.loss import Weights
 from processing.contact.physics.plane import Plane
-from processing.contact.physics.support import CAP_M2, surface_samples, trimmed_vertices, volume_m3
+from processing.contact.physics.support import surface_samples, trimmed_vertices, volume_m3
 from processing.motion.trajectory import PoseSeries
 from recordings.tracks import ObjectShape
 
@@ -47,7 +47,7 @@ def measured_prior(name: ClassName, shape: ObjectShape, physics: Physics, seen_m
 
     Not `measured` as a whole: a part that no camera saw may be far off without the plane being wrong.
     """
-    prior = prior_from_shape(name, shape, physics, cap_m2=CAP_M2)
+    prior = prior_from_shape(name, shape, physics, trimmed=True)
     points = prior.frame.back(start_points(prior))
     unseen = Surface(shape.vertices_m, shape.observed).unseen(points)
     sigma = np.sqrt((1 - unseen) * seen_m**2 + unseen * unseen_m**2)
@@ -93,7 +93,7 @@ def choose_geometry(
 
 def _deep_share(shape: ObjectShape) -> float:
     """The share of the surface that lies deeper below the trimmed hull than bumps and spikes can explain."""
-    points, _ = surface_samples(shape.vertices_m, shape.faces, 3000)
+    points = surface_samples(shape.vertices_m, shape.faces, 3000)
     planes = ConvexHull(trimmed_vertices(shape.vertices_m, shape.faces)).equations
     below = -(points @ planes[:, :3].T + planes[:, 3]).max(1)
     return float((below > DEEP * np.ptp(points, axis=0).mean()).mean())

@@ -161,7 +161,7 @@ def _check_seen_rests(learning: ContactLearning, shape: ObjectShape, prior: Prio
     """Raises BadInput where what a camera saw rests more than 5 mm off the plane: the plane or the scale is wrong.
     What no camera saw proves nothing, and neither does a spike that reaches below the plane."""
     local = prior.frame.inside(shape.vertices_m)
-    points, (surface, _) = start_points(prior), surface_samples(local, shape.faces, SURFACE_POINTS)
+    points, surface = start_points(prior), surface_samples(local, shape.faces, SURFACE_POINTS)
     seen = np.ones(len(points), dtype=bool)
     if shape.observed is not None:
         from scipy.spatial import cKDTree

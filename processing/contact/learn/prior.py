@@ -84,26 +84,26 @@ def prior_from_shape(
     physics: Physics,
     points: int = 64,
     contacts: int = 10,
-    cap_m2: float = 0.0,
+    trimmed: bool = False,
 ) -> Prior:
     """Start from a mesh: its oriented bounding box, its convex hull, or its convex pieces.
 
-    `cap_m2` above 0 (support.CAP_M2) trims the spikes of a measured mesh first.
+    `trimmed` takes the spikes of a measured mesh off first.
     """
     center = physics.center_of_mass_m
     if geometry == "box":
-        around = shape.vertices_m if cap_m2 == 0 else trimmed_vertices(shape.vertices_m, shape.faces, cap_m2)
+        around = trimmed_vertices(shape.vertices_m, shape.faces) if trimmed else shape.vertices_m
         axes, center, half = _oriented_box(around)
         return Prior(Box(half), Frame(axes, center), True, shape.object_frame, shape)
     frame = Frame(np.eye(3), center)
     local = frame.inside(shape.vertices_m)
     free: FreePoints
     if geometry == "hull":
-        free = hull_of(local if cap_m2 == 0 else trimmed_hull(local, shape.faces, points, cap_m2), points)
+        free = hull_of(trimmed_hull(local, shape.faces, points) if trimmed else local, points)
     else:
         from processing.contact.physics.pieces import convex_pieces
 
-        free = convex_pieces(local, shape.faces, points, cap_m2)
+        free = convex_pieces(local, shape.faces, points, trimmed)
     free = FreePoints(free.points_m, free.groups, contacts)
     return Prior(free, frame, True, shape.object_frame, shape)
 

@@ -27,7 +27,7 @@ from processing.contact.physics.loss import (
     step_terms,
 )
 from processing.contact.physics.plane import Plane
-from processing.contact.physics.support import CAP_M2, trimmed_hull
+from processing.contact.physics.support import trimmed_hull
 from processing.motion.trajectory import PoseSeries
 from recordings.geometry import Transform
 from recordings.tracks import ContactModel, ObjectShape, ObjectTrack
@@ -67,7 +67,7 @@ def contact_loss_of(
     """
     plane = plane or Plane(model.plane_normal_world, model.plane_offset_m, "the contact model")
     frame = Frame(np.eye(3), model.center_of_mass_m)
-    points = model.support_vertices_m if shape is None else trimmed_hull(shape.vertices_m, shape.faces, cap_m2=CAP_M2)
+    points = model.support_vertices_m if shape is None else trimmed_hull(shape.vertices_m, shape.faces)
     prepared = prepare(series_of(tracks, world_from_camera), frame, plane, _scaled(model))
     return losses_of(prepared, frame.inside(points), model.friction, _scaled(model), weights)
 

@@ -23,12 +23,12 @@ MOST_FACES = 2500
 
 
 def convex_pieces(
-    vertices_m: Float[Array, "v 3"], faces: Int[Array, "f 3"], points: int = 64, cap_m2: float = 0.0
+    vertices_m: Float[Array, "v 3"], faces: Int[Array, "f 3"], points: int = 64, trimmed: bool = False
 ) -> FreePoints:
     """Cut a mesh by planes along its principal axes until the pieces' hulls are nearly the mesh.
 
     Greedy: the cut of any piece that leaves the least total hull volume. `points` is the most support points of all
-    pieces together; `cap_m2` above 0 trims the pieces' spikes. Only the hulls are wanted, so cuts are left open.
+    pieces together; `trimmed` takes a measured mesh's spikes off. Only the hulls are wanted, so cuts are left open.
     """
     import trimesh
 
@@ -44,7 +44,7 @@ def convex_pieces(
             break
         parts[at : at + 1] = halves
     each = max(8, points // len(parts))
-    found = [support_points(p.reshape(-1, 3), each) if cap_m2 == 0 else _trimmed(p, each, cap_m2) for p in parts]
+    found = [_trimmed(p, each) if trimmed else support_points(p.reshape(-1, 3), each) for p in parts]
     ends = np.cumsum([len(p) for p in found])
     groups = tuple(tuple(range(int(e) - len(p), int(e))) for p, e in zip(found, ends))
     return FreePoints(np.concatenate(found), groups)
@@ -60,9 +60,9 @@ def _coarser(
     return np.asarray(mesh.vertices), np.asarray(mesh.triangles, dtype=np.int64)
 
 
-def _trimmed(triangles: Float[Array, "t 3 3"], points: int, cap_m2: float) -> Float[Array, "p 3"]:
+def _trimmed(triangles: Float[Array, "t 3 3"], points: int) -> Float[Array, "p 3"]:
     vertices = triangles.reshape(-1, 3)
-    return trimmed_hull(vertices, np.arange(len(vertices)).reshape(-1, 3), points, cap_m2)
+    return trimmed_hull(vertices, np.arange(len(vertices)).reshape(-1, 3), points)
 
 
 def _hull_volume(triangles: Float[Array, "t 3 3"]) -> float:
