@@ -98,7 +98,7 @@ def test_the_plane_term_pushes_out_what_lies_below_and_leaves_what_flies() -> No
     up = np.array([0.0, 0.0, 1.0])
     block = plane_block(np.array([0, 1]), np.zeros(0, dtype=np.int64), poses, shape, controls, CENTER, up, 0.0, 12)
     assert set((block.column[block.column < 12] // 6).tolist()) == {0}
-    np.testing.assert_allclose(block.residual, -0.002, atol=1e-9)
+    np.testing.assert_allclose(block.residual, -0.002, atol=1e-5)  # the hull is read from samples
     assert dense(block, 52)[:, 5] == pytest.approx(1.0)
 
 

@@ -23,7 +23,7 @@ from recordings.tracks import ObjectShape
 CAPS = (1 / 1500, 4 / 1500, 16 / 1500)
 """Of the surface: what lies beyond the heights that tell a direction's support. Spikes must have less than the first
 or far less than the last."""
-SAMPLES = 20_000
+SAMPLES = 40_000
 R2 = 1 / 1.32471795724474602596 ** np.array([1, 2])
 DIRECTIONS, FACETS = 300, 60
 FLAT = (0.02, 0.01, 0.005)
@@ -79,8 +79,8 @@ class _HalfSpaces:
         center = samples.mean(0)
         samples = samples - center
         directions = np.concatenate([sphere_directions(DIRECTIONS), _facets(vertices_m)])
-        normals = np.concatenate([face_normals(samples[::5], directions), directions])
-        heights = normals @ samples.T
+        normals = np.concatenate([face_normals(samples[::10], directions), directions])
+        heights = normals.astype(np.float32) @ samples.astype(np.float32).T
         rough = ROUGH * float(np.ptp(samples, axis=0).mean())
         last = [len(samples) - 1 - round(share * len(samples)) for share in CAPS]
         heights.partition(last, axis=1)
