@@ -128,7 +128,8 @@ def learn_from_series(
     sigmas = (config.held_seen_m, config.held_unseen_m)
     choice = choose_geometry(series, shape, physics, plane, config.contact, sigmas, config.geometry)
     prior = measured_prior(choice.name, shape, physics, *sigmas)
-    learning = learn_contact(series, prior, physics, plane, config.contact, progress)
+    alone = replace(config.contact, friction_by_forecasts=False)  # they are made once the geometry is fused
+    learning = learn_contact(series, prior, physics, plane, alone, progress)
     _check_seen_rests(learning, shape, prior)
     surface = Surface(shape.vertices_m, shape.observed)
     field_, readings, sizes = _field(learning, prior, surface, plane, config.fusion)
