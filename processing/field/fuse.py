@@ -197,7 +197,7 @@ def _completed_by_prior(grid: Grid, prior_shape: ObjectShape, painted: Bool[Arra
     unseen = (grid.weight == 0) & ~grid.free
     cells = np.argwhere(unseen)
     distance_m = np.full(grid.sdf_m.shape, np.inf, dtype=np.float32)
-    distance_m[unseen] = _signed_distance(prior_shape, grid.points(cells.astype(np.float64)))
+    distance_m[unseen] = _signed_distance(prior_shape, grid.points(cells.astype(np.float64)), grid.truncation_m)
     filled = _completed(grid, distance_m < 0)
     close = unseen & (np.abs(distance_m) < grid.truncation_m)
     rgb = grid.rgb.copy()
@@ -209,16 +209,22 @@ def _completed_by_prior(grid: Grid, prior_shape: ObjectShape, painted: Bool[Arra
     return replace(filled, sdf_m=np.where(close, distance_m, filled.sdf_m), rgb=_spread(rgb, painted))
 
 
-def _signed_distance(shape: ObjectShape, points_m: Float[Array, "n 3"]) -> Float32[Array, " n"]:
-    """Of points to a closed surface, metres, negative inside."""
+def _signed_distance(shape: ObjectShape, points_m: Float[Array, "n 3"], within_m: float) -> Float32[Array, " n"]:
+    """Of points to a closed surface, metres, negative inside; infinite for those further off than `within_m`, for which
+    only the side is asked: distances are what takes time."""
     import open3d
 
     scene = open3d.t.geometry.RaycastingScene(nthreads=1)
-    scene.add_triangles(
-        open3d.core.Tensor(shape.vertices_m.astype(np.float32)), open3d.core.Tensor(shape.faces.astype(np.uint32))
-    )
-    found = scene.compute_signed_distance(open3d.core.Tensor(points_m.astype(np.float32)), nthreads=1)
-    return np.asarray(found.numpy())
+    corners = shape.vertices_m.astype(np.float32)
+    scene.add_triangles(open3d.core.Tensor(corners), open3d.core.Tensor(shape.faces.astype(np.uint32)))
+    points = points_m.astype(np.float32)
+    inside = scene.compute_occupancy(open3d.core.Tensor(points), nthreads=1).numpy() > 0
+    longest = np.linalg.norm(corners[shape.faces] - corners[np.roll(shape.faces, 1, axis=1)], axis=-1).max()
+    to_corner, _ = cKDTree(corners).query(points, distance_upper_bound=within_m + longest)
+    near = np.isfinite(to_corner)
+    distance = np.full(len(points), np.inf, dtype=np.float32)
+    distance[near] = scene.compute_distance(open3d.core.Tensor(points[near]), nthreads=1).numpy()
+    return np.where(inside, -distance, distance)
 
 
 def _completed(grid: Grid, unseen_inside: Bool[Array, "a b c"]) -> Grid:

@@ -8,7 +8,7 @@ plane and not along the ray, and the network starts at the fused grid.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -32,7 +32,7 @@ class FieldConfig:
     """`dense` on a CPU, `hash` where a GPU is."""
     fuse: FuseConfig = field(default_factory=lambda: FuseConfig(truncation_m=0.005))
     """The warm start."""
-    steps: int = 150
+    steps: int = 60
     """Optimiser steps."""
     rays: int = 2048
     """Object rays a step; a quarter as many rays that pass the object."""
@@ -44,6 +44,8 @@ class FieldConfig:
     """Of the warm-start grid, metres a step."""
     pose_rounds: int = 2
     """How often the views are fused anew and their poses refined in what came out; 0 keeps the poses."""
+    round_voxel_m: float = 0.002
+    """Edge of a cell of what is fused for a round, where the surface matters and not its detail."""
     poses: PoseConfig = field(default_factory=PoseConfig)
     """The Gauss-Newton refinement of a round."""
     eikonal_weight: float = 0.02
@@ -81,7 +83,7 @@ def train_field(
     dataset = make_ray_dataset(views).to(device)
     total = config.pose_rounds + config.steps
     for done in range(config.pose_rounds):
-        start = ObjectField(fuse(views, config.fuse), config.encoding).to(device)
+        start = ObjectField(fuse(views, replace(config.fuse, voxel_m=config.round_voxel_m)), config.encoding).to(device)
         views = refined_views(start, views, dataset, config.poses)
         progress.step(done + 1, total, "field: poses")
     grid = fuse(views, config.fuse, prior_shape)
