@@ -46,8 +46,12 @@ def toss_loops(results: Results, row: Row, session: Session) -> list[Loop]:
     """A loop for every toss of a row whose colour images are there."""
     each = max(FEWEST, FRAMES // max(len(row.tracks), 1))
     loops = []
+    shapes: dict[str | None, ObjectShape] = {}
     for toss, track in row.tracks.items():
-        images = loop_images(session, row, track, _outline_shape(results, row, toss), each)
+        stage = row.record.toss(toss).shape or row.record.shape
+        if stage not in shapes:
+            shapes[stage] = _outline_shape(results, row, toss)
+        images = loop_images(session, row, track, shapes[stage], each)
         if images:
             shown = chosen_frames(track, each)
             times_s = SLOWED * 1e-9 * (track.time_ns[shown] - track.time_ns[shown[0]]).astype(np.float64)
