@@ -117,6 +117,19 @@ def test_a_package_s_library_is_kept_once_under_the_name_that_is_asked_for(check
     }
 
 
+def test_a_library_that_a_running_program_has_loaded_is_replaced_and_not_written_into(check_system, tmp_path):
+    """Set-up for the tests after set-up for the demo ended in a segmentation fault: Python had the libraries loaded."""
+    place, kept = tmp_path / "root" / "usr" / "lib" / "x86_64-linux-gnu", tmp_path / "kept"
+    place.mkdir(parents=True)
+    (place / "libone.so.1").write_bytes(b"library")
+    check_system.keep(tmp_path / "root", kept)
+    with (kept / "libone.so.1").open("rb") as loaded:
+        (place / "libone.so.1").write_bytes(b"a newer one")
+        check_system.keep(tmp_path / "root", kept)
+        assert loaded.read() == b"library"
+    assert [(p.name, p.read_bytes()) for p in kept.iterdir()] == [("libone.so.1", b"a newer one")]
+
+
 def test_a_python_without_pip_gets_it_out_of_debian_s_wheel(make_venv, monkeypatch, tmp_path):
     wheel = next(Path(ensurepip.__file__).parent.glob("_bundled/pip-*.whl"), None) or next(
         Path("/usr/share/python-wheels").glob("pip-*.whl")

@@ -127,13 +127,15 @@ def unpacked(packages: list[str]) -> Iterator[Path]:
 
 
 def keep(root: Path, folder: Path) -> None:
-    """Copy the libraries under `root` flat into `folder`, each once, under the name that programs ask for."""
+    """Copy the libraries under `root` flat into `folder`, each once, under the name that programs ask for. One that is
+    there is replaced, never written into: this very process may have it loaded."""
     folder.mkdir(parents=True, exist_ok=True)
     found = [*root.glob("usr/lib/*/*.so.*"), *root.glob("lib/*/*.so.*")]
     named = {path.resolve() for path in found if path.is_symlink()}
     for path in found:
         if path.is_symlink() or path.resolve() not in named:
-            shutil.copy(path.resolve(), folder / path.name)
+            shutil.copy(path.resolve(), fresh := folder / f"{path.name}.new")
+            fresh.replace(folder / path.name)
 
 
 def quietly(command: list[str], environment: dict[str, str] | None = None, cwd: Path | None = None) -> bool:
