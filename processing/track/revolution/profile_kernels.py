@@ -212,8 +212,8 @@ def _odd_points(rim, usable, config):
 def outline_terms(
     distance_px, table, focal, center, pose, axes, point, y, seen, sizes, config, weight, H, g, Hy, Hyy, gy
 ):
-    """Adds one view's outline. distance_px: distance to the mask's rim (negative inside; far where it may be covered) of
-    all views' pixels. Returns how many points count, of how many, and the sum of their squared residuals (px^2)."""
+    """Adds one view's outline. distance_px: how far all views' pixels lie from the mask's rim (negative inside; far
+    where it may be covered). Returns how many points count, of how many, and their squared residuals' sum (px^2)."""
     found = np.empty((2 * max(int((y[HIGH] - y[LOW]) / config[APART_PX]), 2) + 2 * RING, 6))
     n = outline_points(pose, axes, point, y, seen, sizes, config, found)
     rim, usable = np.zeros((n, 5)), np.zeros(n, np.bool_)
