@@ -16,6 +16,7 @@ from numpy import ndarray as Array
 from recordings.errors import BadInput
 from recordings.geometry import CameraModel
 from recordings.records import RgbdFrame
+from recordings.system_libraries import install_line
 from recordings.tracks import ObjectShape
 
 Occlusion = Literal["fill", "subtract"]
@@ -111,6 +112,11 @@ class DrakeRenderer:
                 "the drake renderer needs Drake, which is not installed; run `pip install -e .[sim]`, "
                 "or leave out `--renderer drake`"
             ) from missing
+        if not _opengl_driver():
+            raise BadInput(
+                "the drake renderer draws with OpenGL, and no driver for it was found; as root, type: "
+                f"{install_line(['libegl-mesa0', 'libgl1-mesa-dri'])}, or leave out `--renderer drake`"
+            )
         import trimesh
 
         self._camera = camera
@@ -168,6 +174,22 @@ class DrakeRenderer:
         )
         depth_m = np.array(image.data)[..., 0]
         return np.where(np.isfinite(depth_m), depth_m, 0).astype(np.float32)
+
+
+def _opengl_driver() -> bool:
+    """Whether EGL has any driver at all: VTK does not ask, and the process ends in a segmentation fault."""
+    import ctypes
+    import sys
+
+    if not sys.platform.startswith("linux"):
+        return True  # the system's own
+    try:
+        egl = ctypes.CDLL("libEGL.so.1")
+    except OSError:
+        return False
+    egl.eglQueryString.restype = ctypes.c_char_p
+    no_display, extensions = None, 0x3055  # EGL_NO_DISPLAY, EGL_EXTENSIONS
+    return bool(egl.eglQueryString(no_display, extensions))  # no client extensions: no vendor's library behind it
 
 
 def _look_up_depth(depth_m: Float32[Array, "h w"], pixels: Float32[Array, "hc wc 2"]) -> Float32[Array, "hc wc"]:

@@ -7,7 +7,9 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from processing.sensor import render
 from processing.sensor.render import RaycastRenderer, make_renderer, reproject
+from recordings.errors import BadInput
 from recordings.geometry import CameraModel
 from recordings.records import RgbdFrame
 from recordings.tracks import ObjectShape
@@ -57,11 +59,20 @@ def test_every_rendered_point_lies_on_the_box(box, camera):
 @pytest.mark.parametrize("camera", [PINHOLE, BENT], ids=["pinhole", "distorted"])
 def test_drake_agrees_to_half_a_millimetre_and_99_percent_of_the_mask(box, camera):
     pytest.importorskip("pydrake", reason="Drake is not installed: pip install -e .[sim]")
+    if not render._opengl_driver():
+        pytest.skip("no OpenGL driver: apt-get install libegl-mesa0 libgl1-mesa-dri")
     pose = at(0.5, Rotation.from_rotvec([0.4, -0.7, 0.3]), 0.05)
     ours, drakes = make_renderer("raycast", box, camera).depth(pose), make_renderer("drake", box, camera).depth(pose)
     both = (ours > 0) & (drakes > 0)
     assert both.sum() / ((ours > 0) | (drakes > 0)).sum() > 0.99
     assert np.quantile(np.abs(ours - drakes)[both], 0.99) < 0.0005
+
+
+def test_without_an_opengl_driver_drake_says_what_to_install_instead_of_ending_the_process(box, monkeypatch):
+    pytest.importorskip("pydrake", reason="Drake is not installed: pip install -e .[sim]")
+    monkeypatch.setattr(render, "_opengl_driver", lambda: False)
+    with pytest.raises(BadInput, match="apt-get install .*libegl-mesa0.* or leave out"):
+        make_renderer("drake", box, PINHOLE)
 
 
 def test_a_shape_behind_the_camera_or_beside_the_image_is_not_drawn(box):
