@@ -183,15 +183,14 @@ def _forms(kind: DistortionModel) -> tuple[LensForm, ...]:
 
 
 def _chosen(fits: Mapping[LensForm, Fit]) -> LensForm:
-    """Of the lenses that their image circles support (of all where none is): the standard one, where one with fewer
-    numbers does not do as well on views kept aside, and none with more does better by a standard error."""
+    """Of the lenses that their image circles support (of all where none is): the standard one, where no other does
+    better by a standard error on views kept aside."""
     fine = {form: f for form, f in fits.items() if _unsupported(f) is None} or fits
     order = sorted(fine, key=lambda form: form.coefficients)
     taken = STANDARD if STANDARD in fine else order[0]
     for form in order:
         gain = gain_by_chance(fine[form].aside_px2, fine[taken].aside_px2)
-        wanted = 0.0 if form.coefficients < taken.coefficients else STANDARD_ERRORS
-        if form != taken and gain > wanted:
+        if form != taken and gain > STANDARD_ERRORS:
             taken = form
     return taken
 

@@ -18,7 +18,7 @@ from recordings.geometry import CameraModel
 LEAST_VIEWS = 5
 FOLDS = 4
 STANDARD_ERRORS = 1.0
-"""A lens with more numbers is taken where it leaves so many standard errors less of views kept aside (the
+"""Another lens than the standard one is taken where it leaves so many standard errors less of views kept aside (the
 one-standard-error rule: Breiman et al., Classification and Regression Trees, 1984, section 3.4.3)."""
 
 
