@@ -64,8 +64,10 @@ def change_cost(
     gravity_camera_m_s2: Float[Array, "3"],
     config: MotionConfig,
     spin_rad_s: Float[Array, "3"] | None = None,
+    flying: bool = False,
 ) -> float:
-    """Cost of the change of motion over three poses, at most impact_cost + shift_cost (and more for very fast spins).
+    """Cost of the change of motion over three poses, at most impact_cost + shift_cost (and more for very fast spins);
+    of spin without a limit where the body is `flying`, because nothing can hit it there.
 
     Zero for a body in free flight with constant spin, and (but for gravity's share) for one at rest. `spin_rad_s`
     (camera axes) is the spin before, where it is known better than from the first two poses.
@@ -80,7 +82,8 @@ def change_cost(
     turn = (float(np.linalg.norm(spin1 - spin0)) / config.usual_turn_rad_s) ** 2
     shift = (change / config.usual_shift_m_s) ** 2
     excess = max(0.0, float(np.linalg.norm(spin1)) / config.fast_turn_rad_s - 1.0)
-    return config.impact_cost * (turn / (1.0 + turn) + excess) + config.shift_cost * shift / (1.0 + shift)
+    turn = turn if flying else turn / (1.0 + turn)
+    return config.impact_cost * (turn + excess) + config.shift_cost * shift / (1.0 + shift)
 
 
 def gravity_in_camera(world_from_camera: Float[Array, "4 4"] | None) -> Float[Array, "3"]:

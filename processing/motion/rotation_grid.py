@@ -33,3 +33,12 @@ def all_turns(count: int) -> Float[Array, "n 3 3"]:
         tilt = rotation_exp(np.arccos(z) * np.array([-np.sin(phi), np.cos(phi), 0.0]))
         out += [tilt @ rotation_exp(np.array([0, 0, 2 * np.pi * a / about])) for a in range(about)]
     return np.array(out)
+
+
+def ball(radius: float, spacing: float) -> Float[Array, "n 3"]:
+    """Points of a body-centred cubic lattice within a ball about zero: no place in it is far from one of them."""
+    edge = spacing * 2 / np.sqrt(3)
+    line = np.arange(-np.ceil(radius / edge), np.ceil(radius / edge) + 1) * edge
+    cube = np.stack(np.meshgrid(line, line, line), -1).reshape(-1, 3)
+    points = np.concatenate([cube, cube + edge / 2])
+    return np.asarray(points[np.linalg.norm(points, axis=1) <= radius])

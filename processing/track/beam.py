@@ -7,10 +7,11 @@ and ranked by the cost of the fit plus that of the change of motion; the best fe
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from numpy import ndarray as Array
 
 from processing.features.sift import FeatureMatcher, Features, RansacConfig, relative_motions
@@ -77,6 +78,8 @@ class Scene:
     center_m: Float[Array, "3"]
     matcher: FeatureMatcher
     features: dict[int, Features] = field(default_factory=dict)
+    flying: Bool[Array, " n"] | None = None
+    """Frames in which nothing touches the body (processing/track/flight.py); None: not known of any."""
     hand: Float[Array, "n 4 4"] | None = None
     """The robot's hand (camera_from_hand), which may hold the object; NaN where it is not known."""
 
@@ -85,6 +88,10 @@ class Scene:
         if self.hand is None or not np.isfinite(self.hand[[before, now], 0, 0]).all():
             return None
         return np.asarray(self.hand[now] @ se3.inverse(self.hand[before]))
+
+    def free(self, frames: Sequence[int]) -> bool:
+        """Whether the body flies in all these frames."""
+        return self.flying is not None and bool(self.flying[list(frames)].all())
 
     def described(self, view: int) -> Features:
         if view not in self.features:
@@ -397,4 +404,4 @@ def _motion_cost(scene: Scene, h: Hypothesis, i: int, pose: Float[Array, "4 4"],
     steps = (times[b] - times[a], times[i] - times[b])
     recent = list(tracked[-6:])
     spin = steady_spin(h.poses[recent], times[recent])
-    return change_cost(three, steps, scene.center_m, scene.gravity_camera_m_s2, config.motion, spin)
+    return change_cost(three, steps, scene.center_m, scene.gravity_camera_m_s2, config.motion, spin, scene.free((a, b, i)))

@@ -52,6 +52,9 @@ class HypothesisConfig:
     round_cost: float = 2.0
     """A body whose views fit so many times worse on one profile is not round: a blurred box (2.9) may look so, mugs fit
     0.9 to 1.6 times as badly."""
+    round_nats: float = 5.0
+    """Nor is one whose appearance speaks so much for the azimuths of free views (log likelihood ratio); what each of the
+    two leaves counts together."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +94,7 @@ def select(
     out = [refined(scene, s, first, keep_first, config) for s in (hypotheses[:1] if agree else hypotheses)]
     out.sort(key=lambda s: s.cost)
     sought = _sought(scene, out, first, keep_first, config) if len(hypotheses) > 1 else None
-    if sought is not None and sought.cost < config.round_cost * out[0].cost:
+    if sought is not None and _is_rather_round(scene, sought, out[0], config):
         return _again([sought], scene, first, keep_first, replace(config, graph=config.round_body))
     out = _compared(scene, out, config)
     if not agree and any(_leave_open(out[0].joint.poses[:n], s.joint.poses[:n], config) for s in out[1:]):
@@ -114,6 +117,20 @@ def _on_shape(
     given = given_azimuths(scene, poses, hypothesis.use, axis, config.azimuth)
     disagreement = _inconsistency(scene, hypothesis, given, config)
     return replace(hypothesis, azimuths=with_uncertainty(given, disagreement, first, config.azimuth))
+
+
+def _is_rather_round(
+    scene: Scene, sought: TrajectoryHypothesis, free: TrajectoryHypothesis, config: HypothesisConfig
+) -> bool:
+    """Whether a round body explains the views about as well as free ones do: its one profile leaves it less freedom,
+    its azimuths must not contradict what is printed on it."""
+    n, worse = len(scene.times_s), float(np.log(sought.cost / free.cost) / np.log(config.round_cost))
+    if worse >= 1.0:
+        return False
+    nats = log_likelihood_ratio(
+        scene, free.joint.poses[:n], sought.joint.poses[:n], free.use & sought.use, config.appearance
+    )
+    return bool(worse + nats / config.round_nats < 1.0)
 
 
 def _compared(
@@ -220,7 +237,8 @@ def refined(
     if _delayed(scene):
         use = use & put_at_color_times(scene, poses[:n], use)
     center_m = center_of_mass(poses[:n], use, scene)
-    motion = Motion(times_s, whose, scene.gravity_camera_m_s2, center_m, still, _carried(scene, use))
+    flying = np.array([scene.flying is not None and i < n and scene.flying[i] for i in range(all_views)], dtype=bool)
+    motion = Motion(times_s, whose, scene.gravity_camera_m_s2, center_m, still, _carried(scene, use), flying)
     seen = np.concatenate([use, drawn])
     if axis is None:
         joint = refine(scene.store, poses, seen, fixed, motion, config.graph)
@@ -261,8 +279,9 @@ def mean_motion_cost(
     index, t = np.flatnonzero(use), scene.times_s
     costs = [
         change_cost(
-            (poses[a], poses[b], poses[c]), (t[b] - t[a], t[c] - t[b]), center_m, scene.gravity_camera_m_s2, config
-        )
+            (poses[a], poses[b], poses[c]), (t[b] - t[a], t[c] - t[b]), center_m, scene.gravity_camera_m_s2, config,
+            flying=scene.free((a, b, c)),
+        )  # fmt: skip
         for a, b, c in zip(index, index[1:], index[2:])
     ]
     return float(np.sum(costs) / max(len(index), 1))

@@ -29,6 +29,7 @@ from processing.track.flags import (
     unjoined,
     unjoined_uncertainty,
 )
+from processing.track.flight import FlightConfig, flights_followed, flying
 from processing.track.hypotheses import HypothesisConfig, TrajectoryHypothesis, apart_deg, select
 from processing.track.keyframes import is_new
 from processing.track.known_shape import ShapeConfig, ShapeViews, center_of, located, shape_views
@@ -51,6 +52,7 @@ class TrackConfig:
     hypotheses: HypothesisConfig = field(default_factory=HypothesisConfig)
     flags: FlagConfig = field(default_factory=FlagConfig)
     shape: ShapeConfig = field(default_factory=ShapeConfig)
+    flight: FlightConfig = field(default_factory=FlightConfig)
     separate_deg: float = 20.0
     """What is estimated forward is a hypothesis of its own where those estimated backward differ from it by more."""
     least_confidence: float = 0.2
@@ -154,6 +156,8 @@ def track_toss(
     world = None if world_from_camera is None else world_from_camera.matrix
     center_m = _first_center_m(store, first, known) if model is None else center_of(model)
     scene = Scene(store, times_s, gravity_in_camera(world), center_m, matcher or Sift(), hand=hand)
+    flight = flying(scene, len(frames), config.flight)
+    scene = replace(scene, flying=np.isin(np.arange(len(frames)), flight))
     if known.poses is None:
         hypotheses, margin, rejected = _followed(scene, first, known, config, progress)
     else:
@@ -278,6 +282,14 @@ def _followed(
         )
         if all(apart_deg(best.poses[:n], s.poses[:n]) > config.separate_deg for s in hypotheses):
             hypotheses.append(best)
+        through = [
+            _anchored(h, best, first)
+            for h in flights_followed(scene, first, best, narrow, config.flight)
+        ]
+        hypotheses += [
+            h for h in through
+            if all(apart_deg(h.poses[:n], s.poses[:n]) > config.separate_deg for s in hypotheses)
+        ]  # fmt: skip
     out = []
     for hypothesis in hypotheses:
         if any(scene.store.usable(i) for i in range(first)):
