@@ -240,9 +240,9 @@ def _fused(
     frame, geometry = prior.frame, learning.fitted.geometry
     start = frame.back(start_points(prior))
     points = frame.inside(start + moves.at(start))
-    config = replace(learning.fitted.config, learn_shape=False, learn_inertia=False, learn_center=False)
-    model = Model(FreePoints(points, geometry.pieces(), geometry.contacts), learning.fitted.inertia_start_kgm2, config)
-    begin = np.concatenate([points.ravel() / SCALE_M, learning.fit.parameters[FRICTION:]])
+    config = replace(learning.fitted.config, learn_shape=False)
+    model = Model(FreePoints(points, geometry.pieces(), geometry.contacts), learning.fitted.inertia_kgm2, config)
+    begin = np.append(points.ravel() / SCALE_M, learning.fit.parameters[FRICTION])
     found = fit_lbfgs(model, begin, learning.data, learning.weights, 20)
     slow = slow_friction(model, found.parameters, learning.prepared, contact_config)
     found, spread = with_friction(found, learning.spread, slow)
@@ -284,7 +284,7 @@ def _document(
 ) -> dict[str, Any]:
     """Everything a reader needs to judge it, as JSON values."""
     seen = np.ones(len(moved_m), dtype=bool) if shape.observed is None else shape.observed
-    inertia = learning.fitted.inertia_start_kgm2
+    inertia = learning.fitted.inertia_kgm2
     losses = {
         name: mean_loss_j(losses_of(learning.prepared, points, friction, inertia))
         for name, points, friction in (

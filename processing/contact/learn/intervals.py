@@ -18,7 +18,6 @@ from numpy import ndarray as Array
 from scipy.stats import t as student
 
 from processing.contact.learn.fit import FRICTION, SHAPE, Model, fit
-from processing.contact.physics.geometry import SCALE_M
 from processing.contact.physics.loss import StepData, Weights, contact_loss, idle_terms, step_terms
 
 PRIOR_FRICTION, PRIOR_SIZE_M = 0.3, 0.02
@@ -55,15 +54,12 @@ class Interval:
 
 @dataclass(frozen=True, eq=False)
 class Spread:
-    """95 % half widths: of friction, of the extents along the axes, of each point, of inertia and centre of mass
-    (NaN where it does not apply), and by which method."""
+    """95 % half widths: of friction, of the extents along the axes, of each point, and by which method."""
 
     method: str
     friction: float
     extents_m: Float[Array, "3"]
     points_m: Float[Array, "v 3"] | None
-    center_m: Float[Array, "3"]
-    inertia_relative: Float[Array, "6"]
 
 
 def extents(points_m: Float[Array, "v 3"]) -> Float[Array, "3"]:
@@ -98,8 +94,6 @@ def bootstrap(
         float(np.hypot(width * (values[:, FRICTION] ** 2).std(ddof=1), 1.96 * MODEL_SHARE * optimum[FRICTION] ** 2)),
         width * np.array([extents(p) for p in points]).std(axis=0, ddof=1),
         width * points.std(axis=0, ddof=1),
-        width * SCALE_M * values[:, -4:-1].std(axis=0, ddof=1),
-        width * values[:, -10:-4].std(axis=0, ddof=1),
     )
 
 
@@ -127,8 +121,7 @@ def curvature(model: Model, optimum: Float[Array, " p"], data: StepData, weights
     model_error = np.array([MODEL_FRICTION] + [MODEL_SIZE] * 3)
     curved = float(student.ppf(0.975, freedom)) * np.sqrt(np.diag(covariance))
     width = np.sqrt(curved**2 + (1.96 * model_error) ** 2)
-    unknown = np.full(3, np.nan)
-    return Spread("curvature of the loss", float(width[0]), width[1:] * size, None, unknown, np.full(6, np.nan))
+    return Spread("curvature of the loss", float(width[0]), width[1:] * size, None)
 
 
 def _sandwich(

@@ -62,14 +62,11 @@ class ContactTerms:
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """What a parameter vector stands for. Points and `center_m` are relative to the prior's centre of mass; the plane
-    lies `plane_m` above z = 0."""
+    """What a parameter vector stands for. Points are relative to the prior's centre of mass."""
 
     points_m: Float[Tensor, "v 3"]
     friction: Float[Tensor, ""]
     inertia_kgm2: Float[Tensor, "3 3"]
-    center_m: Float[Tensor, "3"]
-    plane_m: Float[Tensor, ""]
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,10 +110,8 @@ class StepData:
 
 @dataclass(frozen=True, eq=False)
 class FreeMotion:
-    """Velocities of the centre of mass after a step, and what flight does not explain: dv = v+ - (v + dt a_free)."""
+    """What flight does not explain of a step's change of velocity: dv = v+ - (v + dt a_free)."""
 
-    spin: Float[Tensor, "n 3"]
-    velocity: Float[Tensor, "n 3"]
     spin_change: Float[Tensor, "n 3"]
     velocity_change: Float[Tensor, "n 3"]
 
@@ -127,33 +122,22 @@ def free_motion(data: StepData, body: Body) -> FreeMotion:
     gyro = torch.linalg.cross(data.spin, data.spin @ body.inertia_kgm2)
     spin_free = -torch.linalg.solve(body.inertia_kgm2, gyro.T).T
     gravity = data.position_m.new_tensor([0.0, 0.0, -GRAVITY_M_S2])
-    velocity, before = data.velocity, data.velocity_before
-    if body.center_m.requires_grad or bool(body.center_m.any()):
-        velocity = velocity + _turn(data.rotation, torch.linalg.cross(data.spin, body.center_m.expand_as(data.spin)))
-        arm = body.center_m.expand_as(data.spin)
-        before = before + _turn(data.rotation, torch.linalg.cross(data.spin_before, arm))
     return FreeMotion(
-        data.spin, velocity, data.spin - data.spin_before - dt * spin_free, velocity - before - dt * gravity
+        data.spin - data.spin_before - dt * spin_free, data.velocity - data.velocity_before - dt * gravity
     )
-
-
-def _turn(rotation: Float[Tensor, "n 3 3"], vectors: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-    return torch.bmm(rotation, vectors[..., None])[..., 0]
 
 
 def find_contacts(
     rotation: Float[Tensor, "n 3 3"], position_m: Float[Tensor, "n 3"], body: Body, contacts: int
 ) -> Contacts:
     """The lowest points at each pose; heights are above the plane."""
-    arms = body.points_m - body.center_m
     up = rotation[:, 2]
-    center_z = position_m[:, 2] + up @ body.center_m - body.plane_m
     with torch.no_grad():
-        heights = up @ arms.T
+        heights = up @ body.points_m.T
         count = min(contacts, heights.shape[1])
         index = torch.topk(heights, count, dim=1, largest=False).indices
-    arm = arms[index]
-    height = (arm * up[:, None]).sum(-1) + center_z[:, None]
+    arm = body.points_m[index]
+    height = (arm * up[:, None]).sum(-1) + position_m[:, 2:]
     return Contacts(index, arm, height)
 
 
@@ -231,7 +215,7 @@ def linear_cost(
     data: StepData, body: Body, free: FreeMotion, found: Contacts, weights: Weights
 ) -> Float[Tensor, "n k 3"]:
     """q of the inner problem, divided by w_pred: -J dv + w_comp (0, 0, |phi|) + w_diss dt (mu v_t, mu |v_t|)."""
-    slip = point_velocity(data.rotation, found.arm_m, free.spin, free.velocity)[..., :2]
+    slip = point_velocity(data.rotation, found.arm_m, data.spin, data.velocity)[..., :2]
     change = point_velocity(data.rotation, found.arm_m, free.spin_change, free.velocity_change)
     drag = (weights.dissipation / weights.prediction) * data.step_s[:, None, None] * body.friction
     speed = (slip.square().sum(-1, keepdim=True) + TINY).sqrt()
@@ -291,7 +275,7 @@ def step_terms(data: StepData, body: Body, impulses: Impulses, contacts: int, ep
     part = data.rows(rows)
     free = free_motion(part, body)
     found = find_contacts(part.rotation, part.position_m, body, contacts)
-    slip = point_velocity(part.rotation, found.arm_m, free.spin, free.velocity)[..., :2]
+    slip = point_velocity(part.rotation, found.arm_m, part.spin, part.velocity)[..., :2]
     return StepTerms(
         rows,
         prediction(part, body, free, found.arm_m, lam, epsilon),
@@ -325,16 +309,14 @@ class LossValue:
     impulses: Impulses
 
 
-def contact_loss(
-    data: StepData, body: Body, contacts: int, weights: Weights, epsilon: float = EPSILON, idle_gradient: bool = True
-) -> LossValue:
-    """The loss over all transitions. `idle_gradient` False saves the gradient of rows where nothing touches: exact
-    where inertia and centre of mass are not learned and no screened row penetrates."""
+def contact_loss(data: StepData, body: Body, contacts: int, weights: Weights, epsilon: float = EPSILON) -> LossValue:
+    """The loss over all transitions. Rows where nothing touches take no part in the gradient: exact where none of them
+    penetrates."""
     fixed = Body(*(getattr(body, f.name).detach() for f in fields(Body)))
     impulses = solve_impulses(data, fixed, contacts, weights, epsilon)
     solved = step_terms(data, body, impulses, contacts, epsilon)
-    with torch.set_grad_enabled(idle_gradient and torch.is_grad_enabled()):
-        idle = idle_terms(data, body if idle_gradient else fixed, impulses, contacts)
+    with torch.no_grad():
+        idle = idle_terms(data, fixed, impulses, contacts)
     total_weight = data.weight.sum().clamp_min(TINY)
     loss = data.weight.new_zeros(())
     means = {f.name: 0.0 for f in fields(ContactTerms)}

@@ -102,7 +102,7 @@ class Evaluation:
 
 def prepared_for(learning: ContactLearning, tracks: Sequence[PoseSeries], plane: Plane) -> Prepared:
     """Tracks in the frame that was learned in."""
-    return prepare(tracks, learning.frame, plane, learning.fitted.inertia_start_kgm2)
+    return prepare(tracks, learning.frame, plane, learning.fitted.inertia_kgm2)
 
 
 def evaluate(
@@ -123,7 +123,7 @@ def evaluate(
     prepared = prepared_for(learning, tracks, plane or Plane()) if ready is None else ready
     first = None if begin == "release" else [0 if begin == "first" else _thrown(s) for s in prepared.smoothed]
     fine_s = step_s if learning.law is None else step_s / fine_steps(step_s)
-    start, frames = starts(prepared, fine_s, learning.fitted.inertia_start_kgm2, first)
+    start, frames = starts(prepared, fine_s, learning.fitted.inertia_kgm2, first)
     body, contacts = learning.body(), learning.fitted.geometry.contacts
     if learning.law is None:
         rolled = simulate(body, contacts, start, steps, step_s)
