@@ -15,6 +15,7 @@ import threading
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Self
 
 from recordings.errors import BadInput
 
@@ -80,6 +81,16 @@ class Faulty:
     """A simulator into which faults are injected."""
 
     _faults: Faults
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End it."""
+        raise NotImplementedError
 
     def inject(self, kind: str, at_s: float = 0.0, for_s: float | None = None, **detail: float | str) -> None:
         """Plan a fault `at_s` seconds from now, for `for_s` seconds or until cleared."""

@@ -13,7 +13,7 @@ from recordings.errors import BadInput, DamagedFile
 from recordings.geometry import CameraModel, Transform, quaternion_from_rotation
 from recordings.mcap.codec import decode_image
 from recordings.progress import Progress
-from recordings.records import DepthImage, EncodedImage, HealthLine, RgbdFrame
+from recordings.records import DepthImage, EncodedImage, RgbdFrame
 from recordings.session import Toss
 from recordings.view.scene import Scene
 
@@ -244,8 +244,4 @@ def log_words(clock: Clock, toss: Toss) -> None:
         text = f"toss {clock.toss}: the arm is told to release at {speed:.2f} m/s"
         clock.at(command.time_ns).log(EVENTS, rr.TextLog(text, level=rr.TextLogLevel.INFO))
     for line in toss.health():
-        clock.at(line.time_ns).log(HEALTH, health_entry(line))
-
-
-def health_entry(line: HealthLine) -> rr.TextLog:
-    return rr.TextLog(f"{line.name}: {line.message}", level=LEVELS[line.level])
+        clock.at(line.time_ns).log(HEALTH, rr.TextLog(f"{line.name}: {line.message}", level=LEVELS[line.level]))

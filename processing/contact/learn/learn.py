@@ -142,7 +142,7 @@ def learn_contact(
     optimum = last.parameters
     body = fitted.numbers(optimum)
     touched = touched_points(fitted, body, data, weights)
-    _check_learned_plane(prepared, body)
+    checks.check_plane(_rest_heights(prepared, body.points_m.cpu().numpy()), "the learned shape")
     model, shape, friction, sizes = results_of(fitted, optimum, spread, prior, physics, plane, touched)
     left_out = {**prepared.left_out, **dict.fromkeys(sorted(again), "the same recording as another toss")}
     progress.step(6, 6, "learned")
@@ -209,10 +209,6 @@ def _rest_heights(prepared: Prepared, points_m: Float[Array, "v 3"]) -> dict[int
         if height is not None:
             found[track.toss] = height
     return found
-
-
-def _check_learned_plane(prepared: Prepared, body: Body) -> None:
-    checks.check_plane(_rest_heights(prepared, body.points_m.cpu().numpy()), "the learned shape")
 
 
 def _require_contact(fitted: Model, steps: Steps, prepared: Prepared) -> None:
