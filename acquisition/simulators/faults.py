@@ -15,9 +15,11 @@ import threading
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Self
+from typing import TypeVar
 
 from recordings.errors import BadInput
+
+Opened = TypeVar("Opened", bound="Faulty")
 
 
 @dataclass(frozen=True)
@@ -82,7 +84,7 @@ class Faulty:
 
     _faults: Faults
 
-    def __enter__(self) -> Self:
+    def __enter__(self: Opened) -> Opened:
         return self
 
     def __exit__(self, *exc: object) -> None:
