@@ -19,7 +19,7 @@ from processing.evaluate.report_loops import SLOWED, toss_loops
 from processing.evaluate.report_mesh import turning_shapes
 from processing.evaluate.report_shapes import ERROR_FULL_MM, Shown, shape_picture, true_shape
 from processing.evaluate.report_worst import Worst, worst_frames
-from processing.evaluate.table import COLUMNS, Row, said, with_interval
+from processing.evaluate.table import COLUMNS, CONTACT_COLUMNS, Row, said, with_interval
 from recordings.film.film import STATUS_RGB
 from recordings.film.raster import covered_pixels, outlined
 from recordings.mcap.codec import decode_image
@@ -33,15 +33,7 @@ if TYPE_CHECKING:
     import trimesh
 
 TILE_PX = 360
-PHYSICS = (
-    ("friction", "friction"),
-    ("friction_error", "friction − truth"),
-    ("restitution", "restitution"),
-    ("rollout_track_position", "rollout mm, track"),
-    ("rollout_track_rotation", "rollout deg, track"),
-    ("rollout_position", "rollout mm, truth"),
-    ("rollout_rotation", "rollout deg, truth"),
-)
+PHYSICS = (CONTACT_COLUMNS[0], ("friction_error", "friction − truth"), *CONTACT_COLUMNS[1:])
 STYLE = """body{font:15px/1.5 system-ui,sans-serif;max-width:70em;margin:2em auto;padding:0 1em;color:#222}
 table{border-collapse:collapse;margin:1em 0}td,th{border:1px solid #ccc;padding:.25em .6em;text-align:right}
 td:first-child,th:first-child{text-align:left}th{background:#f3f3f3}.warn{background:#fff4d6;padding:.6em 1em}

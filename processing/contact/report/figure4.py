@@ -9,8 +9,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
 from processing.contact.learn.from_tracks import TrackLearning, TracksConfig, learn_from_tracks
 from processing.contact.learn.learn import ContactLearning
 from processing.contact.learn.shape_comparison import series_of, usable
@@ -21,6 +19,7 @@ from recordings.errors import BadInput
 from recordings.geometry import Transform
 from recordings.progress import Progress
 from recordings.tracks import ObjectShape, ObjectTrack
+from recordings.whole_file import without_nan
 
 STEP_S = 1 / 148
 
@@ -39,7 +38,7 @@ class Figure4:
 
     def to_json(self) -> dict[str, Any]:
         """The document; steps that no toss reaches are None."""
-        document = {
+        return {
             "steps": FIGURE_4_STEPS,
             "dt_s": self.estimated.errors.step_s,
             "learned_from": list(self.learning.tosses),
@@ -47,7 +46,6 @@ class Figure4:
             "friction": self.learning.friction.to_json(),
             "against_track": _part(self.estimated, self.not_learned),
         }
-        return document
 
 
 def learn_figure_4(
@@ -95,13 +93,5 @@ def _part(done: Evaluation, not_learned: Sequence[int]) -> dict[str, Any]:
         for t in not_learned
         if t in per_toss
     }
-    finite: dict[str, Any] = _none_for_nan(document)
+    finite: dict[str, Any] = without_nan(document)
     return finite
-
-
-def _none_for_nan(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {k: _none_for_nan(v) for k, v in value.items()}
-    if isinstance(value, list):
-        return [_none_for_nan(v) for v in value]
-    return None if isinstance(value, float) and not np.isfinite(value) else value
