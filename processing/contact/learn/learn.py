@@ -24,7 +24,7 @@ from processing.contact.learn.touch import plane_by_touch
 from processing.contact.learn.unexplained import unexplained_rows
 from processing.contact.physics.geometry import GeometryName
 from processing.contact.physics.inertia import Physics
-from processing.contact.physics.loss import REFERENCE_MASS_KG, Body, StepData, Weights, contact_loss
+from processing.contact.physics.loss import REFERENCE_MASS_KG, Body, StepData, Weights, contact_loss, find_contacts
 from processing.contact.physics.plane import Plane
 from processing.motion.trajectory import PoseSeries, Steps
 from recordings.progress import Progress, Silent
@@ -305,8 +305,6 @@ def _spread(
 
 def touched_points(fitted: Model, body: Body, data: StepData, weights: Weights) -> Bool[Array, " v"]:
     """Points that carried an impulse, or were pushed out of the plane, in some transition that was learned from."""
-    from processing.contact.physics.loss import find_contacts
-
     impulses = contact_loss(data, body, fitted.geometry.contacts, weights).impulses
     found = find_contacts(data.rotation, data.position_m, body, fitted.geometry.contacts)
     carried = torch.zeros_like(found.height_m, dtype=torch.bool)

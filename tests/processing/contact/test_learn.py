@@ -135,7 +135,7 @@ def test_a_hull_is_learned_from_a_sphere(real_tosses, cube_physics):
 
 
 def test_real_tosses_give_the_cube(real_tosses, cube_physics):
-    """facts/contact.md section 4: weight 30, 4 tosses: friction .170; edges 101.6 102.1 100.7 +- 2.6 mm."""
+    """Measured before with weight 30 on 4 tosses: friction .170; edges 101.6 102.1 100.7 +- 2.6 mm."""
     config = replace(QUICK, weights=Weights(dissipation=30.0))
     learning = learn_contact(real_tosses(range(4)), prior_from_size("box", 0.05), cube_physics, config=config)
     np.testing.assert_allclose([e.value for e in learning.extents], 0.102, atol=0.004)
