@@ -132,7 +132,9 @@ def learn_from_series(
     learning = learn_contact(series, prior, physics, plane, alone, progress)
     _check_seen_rests(learning, shape, prior)
     surface = Surface(shape.vertices_m, shape.observed)
-    field_, readings, sizes = _field(learning, prior, surface, plane, config.fusion)
+    readings, plane_m = readings_of(learning, prior), config.fusion.plane_m if plane.std_m is None else plane.std_m
+    sizes = likely_sizes(readings, surface, config.fusion, plane_m)
+    field_ = Field(readings, sizes, config.fusion, surface, plane_m)
     moved = field_.at(shape.vertices_m)
     refined = ObjectShape(
         shape.object_frame, "contact", shape.vertices_m + moved, shape.faces, shape.vertex_rgb, shape.observed
@@ -222,15 +224,6 @@ def _compared(
     sigma = np.sqrt(((direction * width / 1.96) ** 2).sum(1) + blur_m**2)
     axes = prior.frame.axes
     return Readings(prior.frame.back(at), direction @ axes.T, further, sigma)
-
-
-def _field(
-    learning: ContactLearning, prior: Prior, surface: Surface, plane: Plane, config: FusionConfig
-) -> tuple[Field, Readings, Sizes]:
-    readings = readings_of(learning, prior)
-    plane_m = config.plane_m if plane.std_m is None else plane.std_m
-    sizes = likely_sizes(readings, surface, config, plane_m)
-    return Field(readings, sizes, config, surface, plane_m), readings, sizes
 
 
 def _fused(

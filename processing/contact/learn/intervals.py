@@ -23,6 +23,8 @@ from processing.contact.physics.loss import StepData, Weights, contact_loss, idl
 PRIOR_FRICTION, PRIOR_SIZE_M = 0.3, 0.02
 """Standard deviations that nothing was learned from."""
 CONTACT_LASTS_S = 0.05
+REFIT_SHARE = 0.12
+"""Of the fit's iterations, for a repeat from the optimum."""
 DIFFERENCE_FRICTION, DIFFERENCE_SIZE = 0.02, 0.03
 """Steps of the numerical derivatives: of friction and of the relative size. They reach over the kinks of the loss,
 where another point becomes the lowest: closer by, a kink would pass for certainty."""
@@ -68,13 +70,7 @@ def extents(points_m: Float[Array, "v 3"]) -> Float[Array, "3"]:
 
 
 def bootstrap(
-    model: Model,
-    optimum: Float[Array, " p"],
-    data: StepData,
-    weights: Weights,
-    repeats: int,
-    seed: int,
-    share: float = 0.12,
+    model: Model, optimum: Float[Array, " p"], data: StepData, weights: Weights, repeats: int, seed: int
 ) -> Spread:
     """Repeat the fit on tosses drawn with replacement."""
     rng = np.random.default_rng(seed)
@@ -84,7 +80,7 @@ def bootstrap(
         counts = rng.multinomial(len(tosses), np.full(len(tosses), 1 / len(tosses)))
         part = data.rows(torch.arange(len(data), device=data.weight.device))
         part.weight = data.weight * torch.as_tensor(counts[owner], dtype=torch.float64, device=data.weight.device)
-        drawn.append(fit(model, optimum, part, weights, share).parameters)
+        drawn.append(fit(model, optimum, part, weights, REFIT_SHARE).parameters)
     values = np.array(drawn)
     # n / (n - 1): drawing with replacement narrows the spread of small samples
     width = float(student.ppf(0.975, max(len(tosses) - 1, 1))) * (len(tosses) / max(len(tosses) - 1, 1)) ** 0.5
@@ -164,10 +160,9 @@ def _row_losses(
     return (out * data.weight).cpu().numpy()
 
 
-def plane_sensitivity(
-    fitted: Model, optimum: Float[Array, " p"], data: StepData, weights: Weights, shift_m: float = 0.001
-) -> dict[str, float]:
+def plane_sensitivity(fitted: Model, optimum: Float[Array, " p"], data: StepData, weights: Weights) -> dict[str, float]:
     """What the learned numbers do when the plane is 1 mm higher: metres (or friction) per metre."""
+    shift_m = 0.001
     low = data.rows(torch.arange(len(data), device=data.weight.device))
     low.position_m = data.position_m - data.position_m.new_tensor([0.0, 0.0, shift_m])
     moved = fit(fitted, optimum, low, weights, 0.3).parameters

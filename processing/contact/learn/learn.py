@@ -134,7 +134,10 @@ def learn_contact(
     cpu_seconds = time.process_time() - started
     progress.step(3, 6, "fitted")
     found |= _slow_plane(fitted, optimum, prepared, prior, slow, config.seed)
-    spread = _spread(fitted, optimum, data, weights, config, len(prepared.tracks))
+    if len(prepared.tracks) < 2 or config.bootstrap_repeats < 2:
+        spread = curvature(fitted, optimum, data, weights)
+    else:
+        spread = bootstrap(fitted, optimum, data, weights, config.bootstrap_repeats, config.seed)
     progress.step(4, 6, "intervals")
     sensitivity = plane_sensitivity(fitted, optimum, data, weights)
     progress.step(5, 6, "sensitivity")
@@ -288,19 +291,6 @@ def with_friction(done: Fit, spread: Spread, slow: ForecastFriction | None) -> t
     parameters[FRICTION] = slow.value**0.5
     method = f"{spread.method}; friction by forecasts"
     return replace(done, parameters=parameters), replace(spread, method=method, friction=slow.half_width)
-
-
-def _spread(
-    fitted: Model,
-    optimum: Float[Array, " p"],
-    data: StepData,
-    weights: Weights,
-    config: ContactConfig,
-    tosses: int,
-) -> Spread:
-    if tosses < 2 or config.bootstrap_repeats < 2:
-        return curvature(fitted, optimum, data, weights)
-    return bootstrap(fitted, optimum, data, weights, config.bootstrap_repeats, config.seed)
 
 
 def touched_points(fitted: Model, body: Body, data: StepData, weights: Weights) -> Bool[Array, " v"]:

@@ -177,7 +177,6 @@ def prediction(
     free: FreeMotion,
     arm: Float[Tensor, "n k 3"],
     lam: Float[Tensor, "n k 3"],
-    epsilon: float,
 ) -> Float[Tensor, " n"]:
     """1/2 dv' M dv - lam' J dv + 1/2 lam' (D + eps) lam >= 0, in J: the momentum that the impulses do not explain."""
     one = torch.ones_like(body.friction)
@@ -189,7 +188,7 @@ def prediction(
     impulses = push.square().sum(-1) / REFERENCE_MASS_KG + ((torque @ inverse) * torque).sum(-1)
     momentum = REFERENCE_MASS_KG * free.velocity_change.square().sum(-1)
     momentum = momentum + ((free.spin_change @ body.inertia_kgm2) * free.spin_change).sum(-1)
-    return 0.5 * (momentum + impulses + epsilon * lam.square().sum((1, 2))) - work
+    return 0.5 * (momentum + impulses + EPSILON * lam.square().sum((1, 2))) - work
 
 
 def complementarity(height_m: Float[Tensor, "n k"], lam: Float[Tensor, "n k 3"]) -> Float[Tensor, " n"]:
@@ -235,7 +234,7 @@ class Impulses:
 
 
 @torch.no_grad()
-def solve_impulses(data: StepData, body: Body, contacts: int, weights: Weights, epsilon: float = EPSILON) -> Impulses:
+def solve_impulses(data: StepData, body: Body, contacts: int, weights: Weights) -> Impulses:
     """The impulses of every transition; lam = 0 exactly where q is in K. Updates the data's warm starts."""
     free = free_motion(data, body)
     found = find_contacts(data.rotation, data.position_m, body, contacts)
@@ -243,7 +242,7 @@ def solve_impulses(data: StepData, body: Body, contacts: int, weights: Weights, 
     rows = (~in_cone(q)).nonzero()[:, 0]
     part = data.rows(rows)
     A = jacobian(part.rotation, body.friction, body.inertia_kgm2, found.arm_m[rows])
-    solved = solve_cones(A, q[rows], epsilon, part.warm)
+    solved = solve_cones(A, q[rows], EPSILON, part.warm)
     data.warm[rows] = torch.where(solved.failed[:, None], 0.0, solved.primal)
     return Impulses(rows, solved.impulse, solved.failed, solved.iterations)
 
@@ -267,7 +266,7 @@ class StepTerms:
         )
 
 
-def step_terms(data: StepData, body: Body, impulses: Impulses, contacts: int, epsilon: float = EPSILON) -> StepTerms:
+def step_terms(data: StepData, body: Body, impulses: Impulses, contacts: int) -> StepTerms:
     """The terms of the rows at their impulses (constants). A failed row's impulse lies in the cones too, so its terms
     are an upper bound and it stays in (and is counted); only numbers that overflowed are left out."""
     finite = torch.isfinite(impulses.impulse).all(-1).all(-1)
@@ -278,7 +277,7 @@ def step_terms(data: StepData, body: Body, impulses: Impulses, contacts: int, ep
     slip = point_velocity(part.rotation, found.arm_m, part.spin, part.velocity)[..., :2]
     return StepTerms(
         rows,
-        prediction(part, body, free, found.arm_m, lam, epsilon),
+        prediction(part, body, free, found.arm_m, lam),
         complementarity(found.height_m, lam),
         dissipation(body, slip, part.step_s, lam),
         penetration(found.height_m),
@@ -309,12 +308,12 @@ class LossValue:
     impulses: Impulses
 
 
-def contact_loss(data: StepData, body: Body, contacts: int, weights: Weights, epsilon: float = EPSILON) -> LossValue:
+def contact_loss(data: StepData, body: Body, contacts: int, weights: Weights) -> LossValue:
     """The loss over all transitions. Rows where nothing touches take no part in the gradient: exact where none of them
     penetrates."""
     fixed = Body(*(getattr(body, f.name).detach() for f in fields(Body)))
-    impulses = solve_impulses(data, fixed, contacts, weights, epsilon)
-    solved = step_terms(data, body, impulses, contacts, epsilon)
+    impulses = solve_impulses(data, fixed, contacts, weights)
+    solved = step_terms(data, body, impulses, contacts)
     with torch.no_grad():
         idle = idle_terms(data, fixed, impulses, contacts)
     total_weight = data.weight.sum().clamp_min(TINY)

@@ -56,7 +56,6 @@ def learn_figure_4(
     physics: Physics | None = None,
     config: TracksConfig | None = None,
     progress: Progress | None = None,
-    step_s: float = STEP_S,
 ) -> tuple[Figure4, TrackLearning]:
     """Learn on the estimated tracks of all tosses but the last, and roll all of them out.
 
@@ -69,7 +68,7 @@ def learn_figure_4(
         raise BadInput(f"Figure 4 learns on all tosses but the last; {len(there)} can be used, wanted at least 2")
     learned = {t: tracks[t] for t in there[:-1]}
     found = learn_from_tracks(learned, shape, world_from_camera, plane, physics, config, progress)
-    return figure_4(found.fused, {t: tracks[t] for t in there}, world_from_camera, plane, step_s), found
+    return figure_4(found.fused, {t: tracks[t] for t in there}, world_from_camera, plane), found
 
 
 def figure_4(
@@ -77,11 +76,10 @@ def figure_4(
     tracks: Mapping[int, ObjectTrack],
     world_from_camera: Transform,
     plane: Plane | None = None,
-    step_s: float = STEP_S,
 ) -> Figure4:
     """Roll out all tosses with what was learned on some of them; the tracks are resampled to the step."""
     plane = plane or Plane()
-    done = evaluate(learning, series_of(tracks, world_from_camera), plane, FIGURE_4_STEPS, step_s, "release")
+    done = evaluate(learning, series_of(tracks, world_from_camera), plane, FIGURE_4_STEPS, STEP_S, "release")
     return Figure4(learning, done, tuple(t for t in done.errors.tosses if t not in learning.tosses), plane)
 
 
