@@ -244,11 +244,11 @@ def nearest(
         found = cast(one, np.broadcast_to(view.origin_m, (len(rows), 3)), rays[rows])
         nearer = found["t_hit"] < z[rows]
         z[rows[nearer]], owner[rows[nearer]] = found["t_hit"][nearer], number
-        answers.append(_spread(found, rows, len(rays)))
+        answers.append(_at_rows(found, rows, len(rays)))
     return z, owner, answers
 
 
-def _spread(found: dict[str, Array], rows: Array, count: int) -> dict[str, Array]:
+def _at_rows(found: dict[str, Array], rows: Array, count: int) -> dict[str, Array]:
     if len(rows) == count:
         return found
     spread = {}
