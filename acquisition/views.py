@@ -94,7 +94,7 @@ def record_views(
     interrupts: Interrupts,
 ) -> SessionReport:
     """Views until there are enough, or the stop key. Each holds one image of every camera, a second apart."""
-    target = the_board(setup)
+    target = target_from_document(board_document(setup), str(setup.rig.source))
     report = SessionReport(session.folder, 0)
     kinds = ("rgbd",) if kind == "hand-eye" else ("rgbd", "mono")
     covered = {d.name: Coverage(kind == "board") for d in setup.rig.devices if d.kind in kinds}
@@ -162,10 +162,6 @@ def board_document(setup: Setup) -> dict[str, Any]:
             {"id": t.tag_id, "size_m": t.size_m, "T_board_tag": t.world_from_tag.matrix.tolist()} for t in board_tags()
         ],
     }
-
-
-def the_board(setup: Setup) -> Target:
-    return target_from_document(board_document(setup), str(setup.rig.source))
 
 
 def _images(recorder: Recorder, names: Mapping[str, Coverage]) -> dict[str, Image]:

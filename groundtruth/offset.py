@@ -72,13 +72,11 @@ def object_from_tagged_by_mesh(
     best = min(rms for _, rms in fits)
     alike: list[Array] = []
     for pose, rms in sorted(fits, key=lambda f: f[1]):
-        if rms < 1.2 * best + 1e-4 and all(_angle_between(pose, other) > np.radians(5) for other in alike):
+        if rms < 1.2 * best + 1e-4 and all(
+            Rotation.from_matrix(pose[:3, :3].T @ other[:3, :3]).magnitude() > np.radians(5) for other in alike
+        ):
             alike.append(pose)
     return Fit(Transform.from_matrix("object", "tagged", alike[0]), best, len(alike))
-
-
-def _angle_between(a: Array, b: Array) -> float:
-    return float(Rotation.from_matrix(a[:3, :3].T @ b[:3, :3]).magnitude())
 
 
 def cube_rotations() -> list[Float[Array, "3 3"]]:

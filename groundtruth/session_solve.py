@@ -128,7 +128,7 @@ def solve_session(
     initialise(problem, initial, settings, progress)
     if not any(key[:2] == ("body", BODY) for key in initial.poses):
         raise Undetermined(sorted(c.name for c in problem.config.cameras), _nothing_connects(problem, initial))
-    graph, index = build_graph(problem, initial.poses, settings)
+    graph, index = build_graph(problem, initial.poses)
     order = _order(detections, index)
     drifting = _let_cameras_drift(graph, problem, index, detections, config)
     solution = solve(graph, settings.solver)

@@ -9,7 +9,7 @@ import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 from jaxtyping import Float, Int64
@@ -29,7 +29,7 @@ from groundtruth.session_detections import (
 )
 from groundtruth.session_solve import Solved, solve_session
 from groundtruth.tagslam.answer import pose_rows, reprojection
-from groundtruth.toss_truth import TossTruth, TrackedLimits, at_color_frames
+from groundtruth.toss_truth import Status, TossTruth, TrackedLimits, at_color_frames
 from groundtruth.verdict import Verdict, judge
 from recordings.bounded.documents import json_object
 from recordings.bounded.mesh_file import load_mesh
@@ -270,14 +270,10 @@ def truth_document(truth: SessionTruth, object_from_tagged: Transform | None) ->
             for name, pose in solved.cameras.items()
         },
         "center_of_mass_tagged_m": solved.center_m.tolist(),
-        "frames": {str(toss): _counts(t) for toss, t in truth.tosses.items()},
+        "frames": {str(toss): {s: t.status.count(s) for s in get_args(Status)} for toss, t in truth.tosses.items()},
         **({"d455_witness": truth.d455_refinement.document()} if truth.d455_refinement is not None else {}),
         "verdict": truth.verdict.document(),
     }
-
-
-def _counts(truth: TossTruth) -> dict[str, int]:
-    return {status: truth.status.count(status) for status in ("tracked", "interpolated", "lost")}
 
 
 def _obj_bytes(path: Path) -> bytes:

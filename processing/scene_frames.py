@@ -76,7 +76,7 @@ def scene_frames(run: Run) -> SceneFrames:
         except (TosslabError, OSError) as wrong:
             left_out[t] = f"it cannot be read ({wrong})"
     while True:
-        chosen = _spread(streams, run.config.scene.frames)
+        chosen = _sampled(streams, run.config.scene.frames)
         bad = _unfit(run, streams, chosen)
         if not bad:
             return SceneFrames(streams, chosen, left_out)
@@ -84,7 +84,7 @@ def scene_frames(run: Run) -> SceneFrames:
         streams = {t: s for t, s in streams.items() if t not in bad}
 
 
-def _spread(streams: dict[int, RgbdFrames], wanted: int) -> list[tuple[int, int]]:
+def _sampled(streams: dict[int, RgbdFrames], wanted: int) -> list[tuple[int, int]]:
     numbers = sorted(streams)
     return [(numbers[i], p) for i, p in sample_positions([len(streams[t]) for t in numbers], wanted)]
 

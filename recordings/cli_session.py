@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from importlib import import_module
+from inspect import signature
 from pathlib import Path
 from typing import Any
 
@@ -66,10 +68,10 @@ def _add_folder(layouts: Any) -> None:
         "toss-session import folder recordings/cube_dev sessions/cube",
         "toss-session import folder recordings/cube_dev sessions/cube --truth recordings/cube_dev_truth",
     )
-    parser.add_argument("dir", metavar="DIR", type=Path, help="a folder with session.json and toss_00/{rgb,depth}")
+    parser.add_argument("source", metavar="DIR", type=Path, help="a folder with session.json and toss_00/{rgb,depth}")
     _add_out(parser)
     parser.add_argument("--truth", metavar="TRUTH_DIR", type=Path, help="a *_truth folder, read into truth/")
-    parser.set_defaults(work=_import_folder)
+    parser.set_defaults(work=_import, layout="folder")
 
 
 def _add_bundlesdf(layouts: Any) -> None:
@@ -79,10 +81,10 @@ def _add_bundlesdf(layouts: Any) -> None:
         "Read folders of BundleSDF, FoundationPose or YCBInEOAT: rgb, depth (uint16 mm), masks, cam_K.txt.",
         "toss-session import bundlesdf recordings/milk_00 recordings/milk_01 sessions/milk --fps 30",
     )
-    parser.add_argument("dirs", metavar="DIR", type=Path, nargs="+", help="one folder per toss")
+    parser.add_argument("sources", metavar="DIR", type=Path, nargs="+", help="one folder per toss")
     _add_out(parser)
     parser.add_argument("--fps", type=float, default=30.0, help="frames per second that times are made from (30)")
-    parser.set_defaults(work=_import_bundlesdf)
+    parser.set_defaults(work=_import, layout="bundlesdf")
 
 
 def _add_contactnets(layouts: Any) -> None:
@@ -93,11 +95,13 @@ def _add_contactnets(layouts: Any) -> None:
         "toss-session import contactnets recordings/contactnets sessions/tosses",
         "toss-session import contactnets recordings/tosses sessions/tosses --scale 0.0524 --dt 0.006756757",
     )
-    parser.add_argument("path", metavar="PATH", type=Path, help="a folder of .pt files, one file, or their parent")
+    parser.add_argument("source", metavar="PATH", type=Path, help="a folder of .pt files, one file, or their parent")
     _add_out(parser)
-    parser.add_argument("--scale", metavar="M", type=float, help="metres per unit of position (else params_processed)")
-    parser.add_argument("--dt", metavar="S", type=float, help="seconds per step (else params_processed)")
-    parser.set_defaults(work=_import_contactnets)
+    parser.add_argument(
+        "--scale", dest="scale_m", metavar="M", type=float, help="metres per unit of position (else params_processed)"
+    )
+    parser.add_argument("--dt", dest="dt_s", metavar="S", type=float, help="seconds per step (else params_processed)")
+    parser.set_defaults(work=_import, layout="contactnets")
 
 
 def _add_realsense(layouts: Any) -> None:
@@ -107,9 +111,9 @@ def _add_realsense(layouts: Any) -> None:
         "Read RealSense recordings, .bag or .db3: colour and depth with their own stamps, not aligned.",
         "toss-session import realsense recordings/take_00.db3 recordings/take_01.db3 sessions/milk",
     )
-    parser.add_argument("files", metavar="FILE", type=Path, nargs="+", help="one recording per toss")
+    parser.add_argument("sources", metavar="FILE", type=Path, nargs="+", help="one recording per toss")
     _add_out(parser)
-    parser.set_defaults(work=_import_realsense)
+    parser.set_defaults(work=_import, layout="realsense")
 
 
 def _add_rosbag(layouts: Any) -> None:
@@ -120,45 +124,22 @@ def _add_rosbag(layouts: Any) -> None:
         "toss-session import rosbag recordings/take_00.bag sessions/milk",
         "toss-session import rosbag recordings/take_00 sessions/milk --color /camera/color/image_raw",
     )
-    parser.add_argument("bags", metavar="BAG", type=Path, nargs="+", help="one bag per toss")
+    parser.add_argument("sources", metavar="BAG", type=Path, nargs="+", help="one bag per toss")
     _add_out(parser)
     parser.add_argument("--color", metavar="TOPIC", help="the colour images, where a bag has several")
     parser.add_argument("--depth", metavar="TOPIC", help="the depth images, where a bag has several")
-    parser.set_defaults(work=_import_rosbag)
+    parser.set_defaults(work=_import, layout="rosbag")
 
 
 def _add_out(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("out", metavar="OUT", type=Path, help="the session to make; must not exist yet, or be empty")
 
 
-def _import_folder(args: argparse.Namespace) -> Outcome:
-    from recordings.importers.folder import import_folder
-
-    return _said(import_folder(args.dir, args.out, args.truth, progress_for("import")))
-
-
-def _import_bundlesdf(args: argparse.Namespace) -> Outcome:
-    from recordings.importers.bundlesdf import import_bundlesdf
-
-    return _said(import_bundlesdf(args.dirs, args.out, args.fps, progress_for("import")))
-
-
-def _import_contactnets(args: argparse.Namespace) -> Outcome:
-    from recordings.importers.contactnets import import_contactnets
-
-    return _said(import_contactnets(args.path, args.out, args.scale, args.dt, progress_for("import")))
-
-
-def _import_realsense(args: argparse.Namespace) -> Outcome:
-    from recordings.importers.realsense import import_realsense
-
-    return _said(import_realsense(args.files, args.out, progress_for("import")))
-
-
-def _import_rosbag(args: argparse.Namespace) -> Outcome:
-    from recordings.importers.rosbag import import_rosbag
-
-    return _said(import_rosbag(args.bags, args.out, args.color, args.depth, progress_for("import")))
+def _import(args: argparse.Namespace) -> Outcome:
+    """The layout's importer, given what it asks for by name."""
+    importer = getattr(import_module(f"recordings.importers.{args.layout}"), f"import_{args.layout}")
+    asked = {name: getattr(args, name) for name in signature(importer).parameters if name != "progress"}
+    return _said(importer(**asked, progress=progress_for("import")))
 
 
 def _said(report: Any) -> Outcome:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float, Float32, Int64, UInt8, UInt16
+from jaxtyping import Bool, Float, Float32, Int64, UInt8, UInt16
 from numpy import ndarray as Array
 
 ImageEncoding = Literal["jpeg", "png", "rgb8", "mono8"]
@@ -76,9 +76,12 @@ class ArmStates:
 
     def between(self, start_ns: int, end_ns: int) -> ArmStates:
         """The samples with start_ns <= time <= end_ns."""
-        keep = (self.time_ns >= start_ns) & (self.time_ns <= end_ns)
+        return self.part((self.time_ns >= start_ns) & (self.time_ns <= end_ns))
+
+    def part(self, rows: Bool[Array, " n"] | slice) -> ArmStates:
+        """Some of the samples."""
         return ArmStates(
-            self.time_ns[keep], self.joint_names, self.q_rad[keep], self.dq_rad_s[keep], self.finger_width_m[keep]
+            self.time_ns[rows], self.joint_names, self.q_rad[rows], self.dq_rad_s[rows], self.finger_width_m[rows]
         )
 
 

@@ -314,7 +314,7 @@ class Session:
 
     def file(self, toss: int) -> Path:
         if toss not in self._files:
-            raise BadInput(f"{self.path} has no toss {toss}; it has {_ranges(self.tosses)}")
+            raise BadInput(f"{self.path} has no toss {toss}; it has {', '.join(map(str, self.tosses)) or 'none'}")
         return self._files[toss]
 
     def toss(self, toss: int) -> Toss:
@@ -390,7 +390,3 @@ def _read_attached_calibration(file: McapFile) -> RigCalibration:
         return RigCalibration(cameras={})
     name = f"{file.path}: calibration.json"
     return RigCalibration.from_json(mapping(parse_json(attached, name), name))
-
-
-def _ranges(numbers: Sequence[int]) -> str:
-    return ", ".join(map(str, numbers)) if numbers else "none"

@@ -39,6 +39,11 @@ def file_sha256(path: Path) -> str:
         return hashlib.file_digest(data, "sha256").hexdigest()
 
 
+def without_nan(value: Any) -> Any:
+    """A JSON value as strict JSON has it: null where a number is NaN or infinite, lists for tuples."""
+    return json.loads(json.dumps(value, default=float), parse_constant=lambda _: None)
+
+
 def json_bytes(document: Mapping[str, Any]) -> bytes:
     """A JSON document as it stands in files."""
     return (json.dumps(document, indent=1) + "\n").encode()

@@ -22,6 +22,7 @@ import numpy as np
 import torch
 
 from processing.contact.learn.data_checks import duplicate_groups
+from processing.contact.learn.fit import FRICTION
 from processing.contact.learn.from_tracks import learn_from_series
 from processing.contact.learn.learn import ContactLearning, learn_contact
 from processing.contact.learn.prior import Prior, prior_from_shape, prior_from_size
@@ -80,7 +81,7 @@ def true_cube(learning: ContactLearning, tests: Sequence[PoseSeries]) -> tuple[f
         start = prior_from_size("box", 2 * HALF_M)
         model = replace(learning.fitted, geometry=start.geometry)
         parameters = model.start()
-        parameters[-11] = 0.18**0.5
+        parameters[FRICTION] = 0.18**0.5
         cube = replace(learning, fitted=model, fit=replace(learning.fit, parameters=parameters), frame=start.frame)
         done = evaluate(cube, tests, Plane(offset_m=offset))
         found.append((1e3 * done.position.mean, float(np.degrees(done.rotation.mean))))

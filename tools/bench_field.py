@@ -1,7 +1,7 @@
-"""The neural field's encodings against each other: how fast each reaches which surface, at the true poses and masks,
-so that nothing but the field differs; and without a network (fused views alone: the floor of the other figures).
+"""The neural field: how fast it reaches which surface, at the true poses and masks, so that nothing but the field
+differs; and without a network (fused views alone: the floor of the other figures).
 
-python tools/bench_field.py                                   # cube_dev, dense and hash, CPU
+python tools/bench_field.py                                   # cube_dev, CPU
 python tools/bench_field.py --device cuda --steps 50,150 DIR   # sessions in the folder layout, truth in DIR_truth
 
 One thread; CPU seconds (on a GPU also wall seconds, which include waiting for it).
@@ -88,14 +88,13 @@ def bench(folder: Path, views: list[FieldView], steps: list[int], pose_rounds: i
     shape = grid_mesh(fuse(views, config.fuse))
     fused_s = time.process_time() - start
     print(f"{folder.name}, {len(views)} views, fused only: {surface(shape, truth)}, {fused_s:.1f} CPU-s")
-    for encoding in ("dense", "hash"):
-        for count in steps:
-            cpu, wall = time.process_time(), time.monotonic()
-            trained = train_field(views, replace(config, encoding=encoding, steps=count), device)
-            shape = extract_mesh(trained.field, trained.grid)
-            cpu, wall = time.process_time() - cpu, time.monotonic() - wall
-            spent = f"{cpu:.1f} CPU-s" + (f", {wall:.1f} s" if device != "cpu" else "")
-            print(f"{folder.name} {encoding} {count} steps on {device}: {surface(shape, truth)}, {spent}", flush=True)
+    for count in steps:
+        cpu, wall = time.process_time(), time.monotonic()
+        trained = train_field(views, replace(config, steps=count), device)
+        shape = extract_mesh(trained.field, trained.grid)
+        cpu, wall = time.process_time() - cpu, time.monotonic() - wall
+        spent = f"{cpu:.1f} CPU-s" + (f", {wall:.1f} s" if device != "cpu" else "")
+        print(f"{folder.name} {count} steps on {device}: {surface(shape, truth)}, {spent}", flush=True)
 
 
 def surface(shape: ObjectShape, truth: trimesh.Trimesh) -> str:

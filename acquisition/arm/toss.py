@@ -182,7 +182,7 @@ def check_limits(model: ArmModel, samples: Samples) -> Breach | None:
     low, high = joint_bounds(model)
     jerk = np.diff(samples.ddq, axis=0) / np.diff(samples.time_s)[:, None]
     rows = [
-        ("position", "rad", _off_center(samples.q, low, high), (high - low) / 2 / SHARE),
+        ("position", "rad", np.abs(samples.q - (low + high) / 2), (high - low) / 2 / SHARE),
         ("velocity", "rad/s", np.abs(samples.dq), model.velocity),
         ("acceleration", "rad/s2", np.abs(samples.ddq), model.acceleration),
         ("jerk", "rad/s3", np.abs(jerk), model.jerk),
@@ -198,11 +198,6 @@ def check_limits(model: ArmModel, samples: Samples) -> Breach | None:
         if breach is not None:
             return breach
     return None
-
-
-def _off_center(q: Float[Array, "n j"], low: Float[Array, " j"], high: Float[Array, " j"]) -> Float[Array, "n j"]:
-    """How far each joint is from the middle of its range."""
-    return np.abs(q - (low + high) / 2)
 
 
 def _releases(

@@ -107,7 +107,7 @@ class Space:
         """The worst place of a path (straight lines between joint poses), or None where it keeps all distances."""
         q, share = dense(model, path_rad)
         batch = Batch(model)
-        a, b = (self._in_world(ends) for ends in batch.segments(q))
+        a, b = (self.world_from_base.points(ends.reshape(-1, 3)).reshape(ends.shape) for ends in batch.segments(q))
         radius = np.array([c.radius_m for c in model.capsules])
         found: list[Contact] = []
 
@@ -133,9 +133,6 @@ class Space:
             one, other = (model.capsules[i].link for i in which[k])
             found.append(Contact(one, other, float(share[k]), float(gaps[k]), SELF_CLEARANCE_M + spare_m))
         return max(found, key=lambda c: c.wanted_m - c.clearance_m, default=None)
-
-    def _in_world(self, ends: Float[Array, "n c 3"]) -> Float[Array, "n c 3"]:
-        return self.world_from_base.points(ends.reshape(-1, 3)).reshape(ends.shape)
 
 
 def dense(model: ArmModel, path_rad: Float[Array, "n j"]) -> tuple[Float[Array, "m j"], Float[Array, " m"]]:

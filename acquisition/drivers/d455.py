@@ -78,7 +78,9 @@ class D455Camera(OpenedByContext):
         self._reset()
         self._rs = parts.sdk()
         self._context = self._rs.context()
-        serial = self._check_file() if self._file is not None else self._find()
+        serial = (
+            find_serial(self._rs, self._context, self.name, self._serial) if self._file is None else self._check_file()
+        )
         self._pipeline = self._rs.pipeline(self._context)
         try:
             self._profile = self._config(serial).resolve(self._rs.pipeline_wrapper(self._pipeline))
@@ -174,9 +176,6 @@ class D455Camera(OpenedByContext):
         return Health("warning" if lost else "ok", f"{lost} images lost" if lost else "", received, dropped)
 
     # --- finding and setting up --------------------------------------------------------------------------------
-
-    def _find(self) -> str:
-        return find_serial(self._rs, self._context, self.name, self._serial)
 
     def _check_file(self) -> str:
         assert self._file is not None

@@ -1,7 +1,7 @@
-"""A recorded session played back as devices, at its own pace or as fast as it is read.
+"""A recorded session played back as devices, at its own pace.
 
     setup = replay_setup(Path("sessions/first"))            # what `--rig replay:SESSION` opens
-    player = Player(Session.open(path), pace="fast")        # or device by device
+    player = Player(Session.open(path))                     # or device by device
     player.play(0)
     with player.camera("d455") as camera: frame = camera.read(0.1)
 
@@ -50,7 +50,6 @@ from recordings.records import ArmStates, DepthImage, EncodedImage
 from recordings.session import Session, Toss
 from recordings.sync import frame_period_ns
 
-Pace = Literal["real_time", "fast"]
 LEAD_S = 0.4
 """Playing begins this long after `play`, so that a take is open by then."""
 AFTER_S = 0.3
@@ -80,8 +79,8 @@ class _Track:
 class Player:
     """Plays one toss after another to all devices of a session."""
 
-    def __init__(self, session: Session, pace: Pace = "real_time") -> None:
-        self.session, self.pace = session, pace
+    def __init__(self, session: Session) -> None:
+        self.session = session
         self._lock = threading.Lock()
         self._tracks: dict[str, _Track] = {}
         self._starts_ns = 0
@@ -90,7 +89,7 @@ class Player:
         self._clock: tuple[int, int] | None = None
         """When the first toss was begun (host), and what its session clock said then."""
         self._played_ns = 0
-        """On that clock since then: played as fast as it is read, more than passed."""
+        """On that clock since then: of a toss that was ended early, more than passed."""
         self.later_ns = 0
         """Added to the times of the toss that is played."""
         first = session.toss(session.tosses[0])
@@ -137,10 +136,9 @@ class Player:
             track = self._tracks.get(device)
             cue = track.cues[track.position] if track is not None and track.position < len(track.cues) else None
             due_ns = ends_ns if cue is None else self._starts_ns + cue.at_ns
-        if self.pace == "real_time" or cue is None:
-            stop.wait(max(min(due_ns, ends_ns) - time.monotonic_ns(), 0) / 1e9)
-            if cue is None or time.monotonic_ns() < due_ns or stop.is_set():
-                return None
+        stop.wait(max(min(due_ns, ends_ns) - time.monotonic_ns(), 0) / 1e9)
+        if cue is None or time.monotonic_ns() < due_ns or stop.is_set():
+            return None
         with self._lock:
             if track is not self._tracks.get(device) or track is None:
                 return None  # another toss has begun meanwhile
@@ -264,7 +262,7 @@ class _Replayed(OpenedByContext):
             "serial": str(before.get("serial", "")),
             "firmware": str(before.get("firmware", "")),
             "driver": "replay",
-            "settings": {"session": self._player.session.name, "pace": self._player.pace},
+            "settings": {"session": self._player.session.name, "pace": "real_time"},
             "warnings": [],
         }
 

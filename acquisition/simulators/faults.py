@@ -15,8 +15,11 @@ import threading
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import TypeVar
 
 from recordings.errors import BadInput
+
+Opened = TypeVar("Opened", bound="Faulty")
 
 
 @dataclass(frozen=True)
@@ -80,6 +83,16 @@ class Faulty:
     """A simulator into which faults are injected."""
 
     _faults: Faults
+
+    def __enter__(self: Opened) -> Opened:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End it."""
+        raise NotImplementedError
 
     def inject(self, kind: str, at_s: float = 0.0, for_s: float | None = None, **detail: float | str) -> None:
         """Plan a fault `at_s` seconds from now, for `for_s` seconds or until cleared."""

@@ -74,12 +74,6 @@ class FciServer(Faulty):
             self._gripper.close()
             raise
 
-    def __enter__(self) -> FciServer:
-        return self
-
-    def __exit__(self, *exc: object) -> None:
-        self.close()
-
     def inject(self, kind: str, at_s: float = 0.0, for_s: float | None = None, **detail: float | str) -> None:
         if kind == "reflex" and detail.get("error", "joint_reflex") not in wire.ERRORS:
             raise BadInput(f"no error '{detail['error']}' here; wanted one of {', '.join(wire.ERRORS)}")

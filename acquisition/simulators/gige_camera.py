@@ -66,12 +66,6 @@ class GigeCamera(Faulty):
             thread.start()
         self._threads = threads
 
-    def __enter__(self) -> GigeCamera:
-        return self
-
-    def __exit__(self, *exc: object) -> None:
-        self.close()
-
     def pulse(self) -> None:
         """A rising edge on Line0."""
         if self._get(registers.TRIGGER_SOURCE) == registers.LINE0:

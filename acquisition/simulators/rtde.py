@@ -66,12 +66,6 @@ class UrServer(Faulty):
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
 
-    def __enter__(self) -> UrServer:
-        return self
-
-    def __exit__(self, *exc: object) -> None:
-        self.close()
-
     def snapshot(self) -> dict[str, Any]:
         with self._lock:
             body = self.body

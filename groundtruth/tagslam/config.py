@@ -293,11 +293,10 @@ def _body_tags(
     else:
         raise BadInput(f"tagslam.yaml: body '{name}' has type '{kind}'; wanted one of simple, board, staggered_board")
     over = _both(entry, "override_tag_rotation_noise", "override_tag_position_noise")
-    return {t.tag_id: t if over is None or t.pose is None else replace(t, pose=_blurred(t.pose, over)) for t in found}
-
-
-def _blurred(pose: NoisyPose, noise: tuple[float, float]) -> NoisyPose:
-    return NoisyPose(pose.pose, np.diag([1 / noise[0]] * 3 + [1 / noise[1]] * 3))
+    root = None if over is None else np.diag([1 / over[0]] * 3 + [1 / over[1]] * 3)
+    return {
+        t.tag_id: t if root is None or t.pose is None else replace(t, pose=NoisyPose(t.pose.pose, root)) for t in found
+    }
 
 
 def _tag(tag: Mapping[str, Any], size_m: float, noises: tuple[float, float]) -> TagEntry:

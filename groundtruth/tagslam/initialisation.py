@@ -154,7 +154,7 @@ class Initialisation:
                 yield int(missing[part[0]]), int(place[part[0]]), ready[part]
 
     def _ready(self, observations: Int[Array, " n"], place: int, poses: Float[Array, "k 4 4"]) -> _Ready:
-        chosen = np.unique(np.concatenate([observations[: self.config.most_proposers], self._spread(observations)]))
+        chosen = np.unique(np.concatenate([observations[: self.config.most_proposers], self._judges(observations)]))
         chosen = chosen[np.argsort(-self._areas[chosen], kind="stable")]
         eye, rig, body, tag = (poses[self._chains[chosen, i]] for i in range(4))
         same = np.broadcast_to(np.eye(4), eye.shape)
@@ -174,7 +174,7 @@ class Initialisation:
             tuple(self.problem.observations[i].candidates for i in chosen),
         )
 
-    def _spread(self, observations: Int[Array, " n"]) -> Int[Array, " m"]:
+    def _judges(self, observations: Int[Array, " n"]) -> Int[Array, " m"]:
         return observations[:: max(1, len(observations) // self.config.most_judges)][: self.config.most_judges]
 
     def _propose(self, key: Key, ready: _Ready, stage: Stage) -> Float[Array, "4 4"] | None:

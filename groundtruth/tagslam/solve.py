@@ -40,8 +40,6 @@ class TagSlamSettings:
     """That is done when this many times as many poses are placed, or no more can be,"""
     solve_after: int = 300
     """or, while there are few poses, when one that does not move is among the new ones, or so many are new."""
-    corner_sigma_px: float | None = None
-    """Standard deviation of a corner; None takes the configuration's `pixel_noise`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +79,7 @@ def solve_at_once(problem: Problem, settings: TagSlamSettings, progress: Progres
     """All stamps in one graph."""
     initial = Initialisation(problem, settings.initialisation)
     initialise(problem, initial, settings, progress)
-    graph, index = build_graph(problem, initial.poses, settings)
+    graph, index = build_graph(problem, initial.poses)
     if not graph.projections:
         raise Undetermined(sorted(_spoken(k) for k in initial.missing())[:3] or ["nothing"], _nothing_placed(problem))
     return _result(problem, initial, index, solve(graph, settings.solver))
@@ -107,7 +105,7 @@ def solve_with_amnesia(problem: Problem, settings: TagSlamSettings, progress: Pr
         initial = Initialisation(alone, settings.initialisation)
         initial.poses |= before
         initialise(alone, initial, settings, Silent())
-        graph, index = build_graph(alone, initial.poses, settings)
+        graph, index = build_graph(alone, initial.poses)
         graph.priors += [Prior(index[key], pose, 1e3 * np.eye(6)) for key, pose in before.items()]
         answers.append(_result(replace(alone, stamps=(stamp,)), initial, index, solve(graph, settings.solver)))
         now = {key: answers[-1].solution.poses[number] for key, number in index.items()}
@@ -154,7 +152,7 @@ def initialise(problem: Problem, initial: Initialisation, settings: TagSlamSetti
 
 def _settle(problem: Problem, initial: Initialisation, settings: TagSlamSettings) -> None:
     """Solve what is placed so far, so that drift does not add up."""
-    graph, index = build_graph(problem, initial.poses, settings)
+    graph, index = build_graph(problem, initial.poses)
     try:
         solution = solve(graph, settings.initial_solver)
     except Undetermined:
@@ -164,23 +162,20 @@ def _settle(problem: Problem, initial: Initialisation, settings: TagSlamSettings
             initial.poses[key] = solution.poses[number]
 
 
-def build_graph(
-    problem: Problem, poses: Mapping[Key, Float[Array, "4 4"]], settings: TagSlamSettings
-) -> tuple[Graph, dict[Key, int]]:
+def build_graph(problem: Problem, poses: Mapping[Key, Float[Array, "4 4"]]) -> tuple[Graph, dict[Key, int]]:
     """All factors whose poses are placed."""
     config = problem.config
     graph = Graph([c.model for c in config.cameras])
     index = {key: graph.add_pose(_spoken(key), pose, key[2] or None) for key, pose in poses.items()}
     _add_priors(problem, graph, index)
     eyes: dict[tuple[int, int], int] = {}
-    sigma = settings.corner_sigma_px or config.pixel_noise
     for o in problem.observations:
         keys = chain(problem, o)
         if all(k in index for k in keys):
             camera, rig, body, tag = (index[k] for k in keys)
             eye = _eye(config, o, camera, graph, eyes)
             graph.projections.append(
-                Projection(o.camera, eye, rig, body, tag, o.tag.size_m, o.corners_px, o.sigma_px or sigma)
+                Projection(o.camera, eye, rig, body, tag, o.tag.size_m, o.corners_px, o.sigma_px or config.pixel_noise)
             )
     _add_odometry(problem, graph, index)
     _add_measurements(problem, graph, index)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from html import escape
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +19,7 @@ from processing.evaluate.report_loops import SLOWED, toss_loops
 from processing.evaluate.report_mesh import turning_shapes
 from processing.evaluate.report_shapes import ERROR_FULL_MM, Shown, shape_picture, true_shape
 from processing.evaluate.report_worst import Worst, worst_frames
-from processing.evaluate.table import COLUMNS, Row, said, with_interval
+from processing.evaluate.table import COLUMNS, CONTACT_COLUMNS, Row, said, with_interval
 from recordings.film.film import STATUS_RGB
 from recordings.film.raster import covered_pixels, outlined
 from recordings.mcap.codec import decode_image
@@ -33,15 +33,7 @@ if TYPE_CHECKING:
     import trimesh
 
 TILE_PX = 360
-PHYSICS = (
-    ("friction", "friction"),
-    ("friction_error", "friction − truth"),
-    ("restitution", "restitution"),
-    ("rollout_track_position", "rollout mm, track"),
-    ("rollout_track_rotation", "rollout deg, track"),
-    ("rollout_position", "rollout mm, truth"),
-    ("rollout_rotation", "rollout deg, truth"),
-)
+PHYSICS = (CONTACT_COLUMNS[0], ("friction_error", "friction − truth"), *CONTACT_COLUMNS[1:])
 STYLE = """body{font:15px/1.5 system-ui,sans-serif;max-width:70em;margin:2em auto;padding:0 1em;color:#222}
 table{border-collapse:collapse;margin:1em 0}td,th{border:1px solid #ccc;padding:.25em .6em;text-align:right}
 td:first-child,th:first-child{text-align:left}th{background:#f3f3f3}.warn{background:#fff4d6;padding:.6em 1em}
@@ -102,17 +94,12 @@ def _physics(document: dict[str, Any]) -> str:
     rows = [r for r in document["rows"] if any(n in r["values"] for n, _ in titles)]
     if not rows:
         return ""
-    head = "".join(f"<th>{title}</th>" for _, title in titles)
-    body = "".join(
-        f"<tr><td>{escape(r['variant'])} ({r['scope']})</td>"
-        + "".join(f"<td>{with_interval(r['values'].get(name))}</td>" for name, _ in titles)
-        + "</tr>"
-        for r in rows
-    )
+    cells = ([_row_name(r), *(with_interval(r["values"].get(name)) for name, _ in titles)] for r in rows)
+    table = _table(["variant", *(title for _, title in titles)], cells)
     assumed = f" Of restitution's, {RESTITUTION_ASSUMED}." if any(n == "restitution" for n, _ in titles) else ""
     return (
-        f"<h2>What was learned of contact</h2><table><tr><th>variant</th>{head}</tr>{body}</table><p>Friction against "
-        "the table and restitution; rollouts: the mean error of the learned model, simulated from the release on. In "
+        f"<h2>What was learned of contact</h2>{table}<p>Friction against the table and restitution; rollouts: the mean "
+        "error of the learned model, simulated from the release on. In "
         f"brackets: 95 % intervals.{assumed}</p>"
     )
 
@@ -197,14 +184,12 @@ def _phases_table(main: Row | None) -> str:
     titles = {"adds_auc": "ADD-S %", "add_auc": "ADD %", "success_5deg_5cm": "SR %", "median_rotation": "median deg",
               "p90_rotation": "90 % deg", "median_translation": "median mm", "p90_translation": "90 % mm"}  # fmt: skip
     names = list(titles)
-    head = "".join(f"<th>{n}</th>" for n in ("phase", "frames", *titles.values()))
-    body = "".join(
-        f"<tr><td>{phase}</td><td>{values[names[0]].n}</td>"
-        + "".join(f"<td>{values[n].value:.2f}</td>" for n in names)
-        + "</tr>"
+    cells = (
+        [phase, str(values[names[0]].n), *(f"{values[n].value:.2f}" for n in names)]
         for phase, values in main.score.phases.items()
     )
-    return f"<h3>{escape(main.record.label)}, phase by phase</h3><table><tr>{head}</tr>{body}</table>"
+    table = _table(["phase", "frames", *titles.values()], cells)
+    return f"<h3>{escape(main.record.label)}, phase by phase</h3>{table}"
 
 
 def _notes(document: dict[str, Any]) -> str:
@@ -255,15 +240,12 @@ def _recorded(document: dict[str, Any], session: Session) -> str:
 
 
 def _score_table(document: dict[str, Any]) -> str:
-    head = "".join(f"<th>{escape(title)}</th>" for _, title in COLUMNS)
-    body = ""
-    for row in document["rows"]:
-        cells = "".join(f"<td>{_cell(row, name)}</td>" for name, _ in COLUMNS)
-        body += f"<tr><td>{escape(row['variant'])} ({row['scope']})</td>{cells}</tr>"
+    cells = ([_row_name(row), *(_cell(row, name) for name, _ in COLUMNS)] for row in document["rows"])
+    table = _table(["variant", *(escape(title) for _, title in COLUMNS)], cells)
     grey = "Grey: the paper's figure for this row, on another data set."
     legend = f" <span class=paper>{grey}</span>" if any(row["paper"] for row in document["rows"]) else ""
     return (
-        f"<table><tr><th>variant</th>{head}</tr>{body}</table><p>ADD, ADD-S: area under the recall curve, 0 to 0.1 m. "
+        f"{table}<p>ADD, ADD-S: area under the recall curve, 0 to 0.1 m. "
         "SR: share of frames within 5 degrees and 5 cm. CD: Chamfer distance of the shape. Each toss is aligned at its "
         f"first frame.{legend}</p>"
     )
@@ -279,15 +261,24 @@ def _cell(row: dict[str, Any], name: str) -> str:
 def _toss_table(row: dict[str, Any]) -> str:
     names = [n for n in ("adds_auc", "add_auc", "success_5deg_5cm") if any(n in t for t in row["per_toss"])]
     titles = {"adds_auc": "ADD-S %", "add_auc": "ADD %", "success_5deg_5cm": "SR %"}
-    head = "".join(f"<th>{titles.get(n, n)}</th>" for n in ("toss", "tracked", "interpolated", "lost", *names))
-    body = "".join(
-        f"<tr><td>{t['toss']}</td>"
-        + "".join(f"<td>{t[s]}</td>" for s in ("tracked", "interpolated", "lost"))
-        + "".join("<td>–</td>" if t.get(n) is None else f"<td>{t[n]:.1f}</td>" for n in names)
-        + "</tr>"
+    counts = ("toss", "tracked", "interpolated", "lost")
+    cells = (
+        [*(str(t[s]) for s in counts), *("–" if t.get(n) is None else f"{t[n]:.1f}" for n in names)]
         for t in row["per_toss"]
     )
-    return f"<h3>{escape(row['label'])} ({row['scope']})</h3><table><tr>{head}</tr>{body}</table>"
+    table = _table([*counts, *(titles.get(n, n) for n in names)], cells)
+    return f"<h3>{escape(row['label'])} ({row['scope']})</h3>{table}"
+
+
+def _table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
+    """A table of texts that are HTML already."""
+    top = "".join(f"<th>{text}</th>" for text in head)
+    body = "".join(f"<tr>{''.join(f'<td>{text}</td>' for text in row)}</tr>" for row in rows)
+    return f"<table><tr>{top}</tr>{body}</table>"
+
+
+def _row_name(row: dict[str, Any]) -> str:
+    return f"{escape(row['variant'])} ({row['scope']})"
 
 
 def _loops(results: Results, row: Row | None, session: Session) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -14,7 +13,7 @@ from processing.variants import ROWS, TABLE, WITH_MODEL
 from recordings.notices import Notice, in_order, said_of
 from recordings.results.folder import Results, VariantRecord
 from recordings.tracks import ObjectTrack
-from recordings.whole_file import write_bytes, write_json
+from recordings.whole_file import without_nan, write_bytes, write_json
 
 TABLE_FORMAT = 1
 COLUMNS = (
@@ -211,16 +210,10 @@ def _cell(row: dict[str, Any], name: str) -> str:
 
 def write_table(results: Results, rows: Sequence[Row]) -> dict[str, Any]:
     """Write table.json and table.md into the results folder; returns table.json's content."""
-    document = _finite(table_document(results, rows))
+    document = without_nan(table_document(results, rows))  # an infinite error of a lost frame has no number
     write_json(results.path / "table.json", document)
     write_bytes(results.path / "table.md", markdown(document).encode())
     return document
-
-
-def _finite(value: Any) -> Any:
-    """Strict JSON: an infinite error of a lost frame has no number."""
-    text = json.dumps(value)
-    return json.loads(text, parse_constant=lambda _: None)
 
 
 def summary(documents: Sequence[dict[str, Any]]) -> str:

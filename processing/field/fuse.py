@@ -113,11 +113,11 @@ def fuse(views: Sequence[FieldView], config: FuseConfig, prior_shape: ObjectShap
     grid = Grid(low, voxel_m, config.truncation_m, sdf_m, weight, free, rgb)
     painted = paint[..., 3] > 0
     if prior_shape is None:
-        return replace(complete(grid), rgb=_spread(rgb, painted))
+        return replace(complete(grid), rgb=_nearest_color(rgb, painted))
     return _completed_by_prior(grid, prior_shape, painted)
 
 
-def _spread(rgb: Float32[Array, "a b c 3"], known: Bool[Array, "a b c"]) -> Float32[Array, "a b c 3"]:
+def _nearest_color(rgb: Float32[Array, "a b c 3"], known: Bool[Array, "a b c"]) -> Float32[Array, "a b c 3"]:
     """Every cell without a colour takes that of the nearest cell that has one."""
     if not known.any():
         return rgb
@@ -206,7 +206,7 @@ def _completed_by_prior(grid: Grid, prior_shape: ObjectShape, painted: Bool[Arra
         _, nearest = cKDTree(prior_shape.vertices_m).query(grid.points(np.argwhere(shown).astype(np.float64)))
         rgb[shown] = prior_shape.vertex_rgb[nearest] / np.float32(255)
         painted = painted | shown
-    return replace(filled, sdf_m=np.where(close, distance_m, filled.sdf_m), rgb=_spread(rgb, painted))
+    return replace(filled, sdf_m=np.where(close, distance_m, filled.sdf_m), rgb=_nearest_color(rgb, painted))
 
 
 def _signed_distance(shape: ObjectShape, points_m: Float[Array, "n 3"], within_m: float) -> Float32[Array, " n"]:

@@ -15,7 +15,6 @@ import torch
 from torch import Tensor
 from torch.optim.adam import adam
 
-from processing.field.encoding import EncodingName
 from processing.field.fuse import FuseConfig, Grid, fuse
 from processing.field.network import ObjectField
 from processing.field.poses import PoseConfig, refine_poses
@@ -28,8 +27,6 @@ from recordings.tracks import ObjectShape
 
 @dataclass(frozen=True)
 class FieldConfig:
-    encoding: EncodingName = "dense"
-    """`dense` on a CPU, `hash` where a GPU is."""
     fuse: FuseConfig = field(default_factory=lambda: FuseConfig(truncation_m=0.005))
     """The warm start."""
     steps: int = 60
@@ -83,11 +80,11 @@ def train_field(
     dataset = make_ray_dataset(views).to(device)
     total = config.pose_rounds + config.steps
     for done in range(config.pose_rounds):
-        start = ObjectField(fuse(views, replace(config.fuse, voxel_m=config.round_voxel_m)), config.encoding).to(device)
+        start = ObjectField(fuse(views, replace(config.fuse, voxel_m=config.round_voxel_m))).to(device)
         views = refined_views(start, views, dataset, config.poses)
         progress.step(done + 1, total, "field: poses")
     grid = fuse(views, config.fuse, prior_shape)
-    model = ObjectField(grid, config.encoding).to(device)
+    model = ObjectField(grid).to(device)
     losses = _optimise(model, stack_poses(views, device), dataset, config, progress)
     return TrainedField(model, grid, tuple(views), losses)
 
@@ -110,7 +107,7 @@ def refined_views(
 def _optimise(
     model: ObjectField, poses: Poses, dataset: RayDataset, config: FieldConfig, progress: Progress
 ) -> tuple[float, ...]:
-    networks = [*model.encoding.parameters(), *model.geometry.parameters(), *model.appearance.parameters()]
+    networks = [model.features, *model.geometry.parameters(), *model.appearance.parameters()]
     warm = [model.warm_distance, model.warm_color]
     groups = [Moments(networks, config.learning_rate), Moments(warm, config.warm_learning_rate)]
     losses = []

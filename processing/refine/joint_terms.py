@@ -46,7 +46,7 @@ def _dense(name: str, residual: Array, weight: Array, columns: Array, values: Ar
     return Block(name, residual, weight, row, columns.reshape(-1).astype(np.int64), values.reshape(-1))
 
 
-def _spread(residual: Float[Array, "*n"], least: float) -> float:
+def _robust_sigma(residual: Float[Array, "*n"], least: float) -> float:
     return max(MAD_TO_SIGMA * float(np.median(np.abs(residual))), least) if residual.size else least
 
 
@@ -123,7 +123,7 @@ def depth_block(
     gap = ((points - nearest) * normal).sum(1)
     use = facing & (np.abs(gap) < REACH_M)
     points, nearest, normal, gap = points[use], nearest[use], normal[use], gap[use]
-    weight = _tukey(gap, _spread(gap, noise.JOINT_LEAST_SIGMA_M)) / points_per_measurement
+    weight = _tukey(gap, _robust_sigma(gap, noise.JOINT_LEAST_SIGMA_M)) / points_per_measurement
     pose = np.concatenate([-np.cross(points - center_m, normal), -normal], 1)
     near, pull = controls.weights(nearest)
     columns = np.concatenate([np.tile(6 * frame + np.arange(6), (len(gap), 1)), first + near], 1)
@@ -203,7 +203,7 @@ def _chained(name: str, residual: list[Array], columns: list[Array], values: lis
         empty = np.zeros(0)
         return _dense(name, empty, empty, np.zeros((0, 1)), np.zeros((0, 1)))
     r = np.stack(residual)
-    sigma = np.r_[np.full(3, _spread(r[:, :3], LEAST_M)), np.full(3, _spread(r[:, 3:], LEAST_RAD))]
+    sigma = np.r_[np.full(3, _robust_sigma(r[:, :3], LEAST_M)), np.full(3, _robust_sigma(r[:, 3:], LEAST_RAD))]
     share = np.clip(np.abs(r) / (4.685 * sigma), 0, 1)
     weight = (1 - share**2) ** 2 / sigma**2
     wide = np.repeat(np.stack(columns)[:, None], 6, 1)
@@ -237,7 +237,7 @@ def plane_block(
     pose = np.concatenate([np.cross(corners[corner] - center_m, up), up], 1)
     grows = (up * along[corner]).sum(1)[:, None] * pull[corner]
     columns = np.concatenate([6 * frame[:, None] + np.arange(6), first + near[corner]], 1)
-    weight = _tukey(residual, _spread(residual, LEAST_PLANE_M)) / noise.JOINT_CONTACTS_PER_MEASUREMENT
+    weight = _tukey(residual, _robust_sigma(residual, LEAST_PLANE_M)) / noise.JOINT_CONTACTS_PER_MEASUREMENT
     return _dense("plane", residual, weight, columns, np.concatenate([pose, grows], 1))
 
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int64
@@ -12,6 +12,7 @@ from numpy import ndarray as Array
 
 from processing.sensor.render import Occlusion, Renderer, Reprojection, reproject
 from recordings.records import RgbdFrame
+from recordings.session import Frames
 
 Depth = Literal["rendered", "filled"]
 SHADOW_PX = 9
@@ -89,7 +90,7 @@ def occluders(
     return drawn.mask & ~raw_mask & (depth_m > 0) & (depth_m < drawn.depth_m - before_m)
 
 
-class SecondFrames(Sequence[RgbdFrame]):
+class SecondFrames(Frames[RgbdFrame]):
     """The frames of one toss for the second pass, drawn when asked for. `masks` and `colorless` go with them."""
 
     def __init__(
@@ -101,12 +102,13 @@ class SecondFrames(Sequence[RgbdFrame]):
         renderer: Renderer,
         config: RedrawConfig,
     ) -> None:
+        super().__init__(times_ns, lambda i: self.redrawn(i).frame)
         self._frames, self._raw_masks, self._poses = frames, raw_masks, poses
         self._renderer, self._config = renderer, config
         self._last: tuple[int, Redrawn] | None = None
         self.depth_times_ns = times_ns
-        self.masks = _Part(self, "mask")
-        self.colorless = _Part(self, "colorless")
+        self.masks = Frames(times_ns, lambda i: self.redrawn(i).mask)
+        self.colorless = Frames(times_ns, lambda i: self.redrawn(i).colorless)
 
     def redrawn(self, position: int) -> Redrawn:
         """Frame, mask and colourless pixels of one position; the last one asked for is kept."""
@@ -114,29 +116,3 @@ class SecondFrames(Sequence[RgbdFrame]):
             raw, mask = self._frames[position], np.asarray(self._raw_masks[position], dtype=bool)
             self._last = (position, redraw(raw, mask, self._poses[position], self._renderer, self._config))
         return self._last[1]
-
-    def __len__(self) -> int:
-        return len(self._frames)
-
-    def __getitem__(self, position: Any) -> Any:
-        if isinstance(position, slice):
-            return [self.redrawn(i).frame for i in range(len(self))[position]]
-        return self.redrawn(range(len(self))[position]).frame
-
-    def __iter__(self) -> Iterator[RgbdFrame]:
-        return (self.redrawn(i).frame for i in range(len(self)))
-
-
-class _Part(Sequence[Bool[Array, "h w"]]):
-    """Masks or colourless pixels of the redrawn frames."""
-
-    def __init__(self, frames: SecondFrames, name: Literal["mask", "colorless"]) -> None:
-        self._of, self._name = frames, name
-
-    def __len__(self) -> int:
-        return len(self._of)
-
-    def __getitem__(self, position: Any) -> Any:
-        if isinstance(position, slice):
-            return [self[i] for i in range(len(self))[position]]
-        return getattr(self._of.redrawn(range(len(self))[position]), self._name)

@@ -36,7 +36,7 @@ from recordings.progress import Progress
 from recordings.results.folder import VariantRecord, write_contact, write_shape, write_variant
 from recordings.results.stage_files import stage_document
 from recordings.tracks import ObjectShape
-from recordings.whole_file import write_json
+from recordings.whole_file import without_nan, write_json
 
 if TYPE_CHECKING:
     from recordings.session import Session
@@ -152,18 +152,7 @@ def _write(
     write_assets(folder, learning.model, shape)
     draw_result(folder / "rollout.png", learning, evaluation, marked, session.name)
     write_rollouts(folder, learning, evaluation, plane)
-    write_json(folder / "result.json", _finite(document))
-
-
-def _finite(value: Any) -> Any:
-    """JSON has no NaN: None instead (a step that no toss reaches)."""
-    if isinstance(value, Mapping):
-        return {k: _finite(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(v) for v in value]
-    if isinstance(value, float | np.floating):
-        return float(value) if np.isfinite(value) else None
-    return value
+    write_json(folder / "result.json", without_nan(document))  # a step that no toss reaches has no number
 
 
 def _record(out_dir: Path, session: Session, stage: str) -> None:

@@ -79,20 +79,17 @@ def frames_of(run: Run, track: ObjectTrack, seen: TossImages, config: JointConfi
         pose = track.camera_from_object[i]
         at_depth = np.linalg.inv(pose) @ pose_at(track, i, int(seen.depth_times_ns[i]))
         time_s = 1e-9 * float(track.time_ns[i] - track.time_ns[0])
-        out.append(_frame(track.toss, i, time_s, seen.frames[i], mask, rays, at_depth, track.covariance[i], config))
+        points = _points(seen.frames[i], mask, rays, config.depth_points)
+        out.append(FrameData(track.toss, i, time_s, points, at_depth, track.covariance[i]))
     return out
 
 
-def _frame(
-    toss: int, position: int, time_s: float, frame: RgbdFrame, mask: Array, rays: Float[Array, "h w 3"],
-    at_depth: Float[Array, "4 4"], covariance: Float[Array, "6 6"], config: JointConfig,
-) -> FrameData:  # fmt: skip
+def _points(frame: RgbdFrame, mask: Array, rays: Float[Array, "h w 3"], most: int) -> Float[Array, "n 3"]:
     inside = cv2.erode(mask.astype(np.uint8), np.ones((2 * BORDER_PX + 1,) * 2, np.uint8)).astype(bool)
     v, u = np.nonzero(inside & (frame.depth_m > 0))
-    chosen = np.linspace(0, len(v) - 1, min(len(v), config.depth_points)).astype(int)
+    chosen = np.linspace(0, len(v) - 1, min(len(v), most)).astype(int)
     v, u = v[chosen], u[chosen]
-    points = rays[v, u] * frame.depth_m[v, u, None].astype(np.float64)
-    return FrameData(toss, position, time_s, points, at_depth, covariance)
+    return np.asarray(rays[v, u] * frame.depth_m[v, u, None].astype(np.float64))
 
 
 def outside(run: Run, tracks: Mapping[int, ObjectTrack], frames: list[FrameData], body: ObjectShape) -> World | None:

@@ -3,7 +3,7 @@ laid onto raw depth first where wanted, and the masks M' (M'') there."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ from processing.run import Run
 from processing.sensor.render import make_renderer
 from processing.store import Done
 from recordings.results.folder import read_shape, read_track, write_masks, write_track
+from recordings.session import Frames
 from recordings.tracks import ObjectShape, ObjectTrack
 
 VERSION = 5
@@ -75,7 +76,7 @@ def _laid_on_depth(
 ) -> tuple[ObjectTrack, dict[str, int], dict[str, Any]]:
     times_ns = seen.depth_times_ns
     at_depth = np.stack([pose_at(track, i, int(times_ns[i])) for i in range(len(track.status))])
-    depths = _Depths(seen.frames)
+    depths = Frames(times_ns, lambda i: seen.frames[i].depth_m)
     found = align_frames(body, depths, seen.masks, run.camera, at_depth, run.config.cycle.icp, track.covariance)
     poses = track.camera_from_object.copy()
     for i, alignment in enumerate(found):
@@ -88,16 +89,3 @@ def _laid_on_depth(
         "held": np.array([a.held for a in found]),
     }
     return replace(track, camera_from_object=poses), count_verdicts(found), details
-
-
-class _Depths(Sequence[Any]):
-    """Depth images alone, read one by one."""
-
-    def __init__(self, frames: Sequence[Any]) -> None:
-        self._frames = frames
-
-    def __len__(self) -> int:
-        return len(self._frames)
-
-    def __getitem__(self, position: Any) -> Any:
-        return self._frames[position].depth_m

@@ -7,6 +7,7 @@ through the variant's record and copied, so that an export needs nothing but the
 from __future__ import annotations
 
 import shutil
+from functools import partial
 from pathlib import Path
 
 from recordings.errors import BadInput
@@ -19,24 +20,10 @@ ASSETS = "assets"
 """`<contact stage>/assets/<format>/` holds the asset of a format with its meshes."""
 
 
-def export_urdf(source: Path, out: Path, variant: str | None, scope: str | None, progress: Progress) -> ExportReport:
-    """Write a URDF and its meshes."""
-    return _export("urdf", source, out, variant, scope)
-
-
-def export_mjcf(source: Path, out: Path, variant: str | None, scope: str | None, progress: Progress) -> ExportReport:
-    """Write a MuJoCo model and its meshes."""
-    return _export("mjcf", source, out, variant, scope)
-
-
-def export_drake_sdf(
-    source: Path, out: Path, variant: str | None, scope: str | None, progress: Progress
+def _export(
+    name: str, source: Path, out: Path, variant: str | None, scope: str | None, progress: Progress
 ) -> ExportReport:
-    """Write an SDFormat model for Drake and its meshes."""
-    return _export("drake-sdf", source, out, variant, scope)
-
-
-def _export(name: str, source: Path, out: Path, variant: str | None, scope: str | None) -> ExportReport:
+    """Write the asset of a format and its meshes."""
     results = open_results(source)
     folders = _asset_folders(results, results.find(variant, scope), name)
     with new_files(out) as made:
@@ -65,3 +52,6 @@ def _asset_folders(results: Results, record: VariantRecord, name: str) -> dict[s
                 f"the contact model in {folder.parent.parent} has no {name} asset; run toss-process again to make it"
             )
     return folders
+
+
+export_urdf, export_mjcf, export_drake_sdf = (partial(_export, name) for name in ("urdf", "mjcf", "drake-sdf"))

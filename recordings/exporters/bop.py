@@ -5,6 +5,7 @@ scene_gt.json holds the ESTIMATED poses: the layout has no other place for them.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -101,7 +102,7 @@ def _write_scene(folder: Path, session: Session, toss: Toss, track: ObjectTrack,
     cameras: dict[str, Any] = {}
     poses: dict[str, list[dict[str, Any]]] = {}
     lines = []
-    for i, (image, (raw, scale)) in enumerate(zip(colors, _Depths(toss), strict=True)):
+    for i, (image, (raw, scale)) in enumerate(zip(colors, _depths(toss), strict=True)):
         suffix, data = image_file(image)
         (scene / "rgb" / f"{i:06d}{suffix}").write_bytes(data)
         (scene / "depth" / f"{i:06d}.png").write_bytes(depth_png(raw))
@@ -117,22 +118,17 @@ def _write_scene(folder: Path, session: Session, toss: Toss, track: ObjectTrack,
     return lines
 
 
-class _Depths:
+def _depths(toss: Toss) -> Iterator[tuple[UInt16[Array, "h w"], float]]:
     """Depth of every colour frame and its scale to mm: as recorded where it is aligned already, else in 0.1 mm."""
-
-    def __init__(self, toss: Toss) -> None:
-        self._toss = toss
-
-    def __iter__(self) -> Any:
-        frames, depths = self._toss.rgbd(CAMERA), self._toss.depth(CAMERA)
-        aligned = f"{CAMERA}_depth" not in self._toss.calibration.cameras
-        position = {t: k for k, t in enumerate(depths.times_ns.tolist())}
-        for i in range(len(frames)):
-            if aligned and i not in frames.without_depth:
-                image = depths[position[int(frames.depth_times_ns[i])]]
-                yield image.raw, float(f"{image.unit_m * MM:.9g}")
-            else:
-                yield _tenths(frames[i].depth_m), 0.1
+    frames, depths = toss.rgbd(CAMERA), toss.depth(CAMERA)
+    aligned = f"{CAMERA}_depth" not in toss.calibration.cameras
+    position = {t: k for k, t in enumerate(depths.times_ns.tolist())}
+    for i in range(len(frames)):
+        if aligned and i not in frames.without_depth:
+            image = depths[position[int(frames.depth_times_ns[i])]]
+            yield image.raw, float(f"{image.unit_m * MM:.9g}")
+        else:
+            yield _tenths(frames[i].depth_m), 0.1
 
 
 def _tenths(depth_m: Array) -> UInt16[Array, "h w"]:

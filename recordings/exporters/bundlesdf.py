@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +12,6 @@ from numpy import ndarray as Array
 from recordings.errors import BadInput
 from recordings.exporters.common import ExportReport, count_files, new_files, open_recording
 from recordings.exporters.images import depth_png, image_file
-from recordings.geometry import CameraModel
 from recordings.mcap.codec import encode_mask
 from recordings.progress import Progress
 from recordings.results.folder import Results
@@ -40,7 +39,9 @@ def export_bundlesdf(
             progress.step(done, len(numbers), f"toss {number}")
             toss = session.toss(number)
             if results is not None and record is not None:
-                masks = _as_mapping(results.masks(record.name, record.scope, number))
+                masks: Mapping[int, Bool[Array, "h w"]] = dict(
+                    enumerate(results.masks(record.name, record.scope, number))
+                )
             else:
                 masks = toss.masks()
             _write_toss(made / toss_name(number), session, toss, masks, notes)
@@ -48,10 +49,6 @@ def export_bundlesdf(
     progress.step(len(numbers), len(numbers))
     session.close()
     return ExportReport("bundlesdf", out, files, tuple(dict.fromkeys(notes)))
-
-
-def _as_mapping(masks: Sequence[Bool[Array, "h w"]]) -> Mapping[int, Bool[Array, "h w"]]:
-    return {i: masks[i] for i in range(len(masks))}
 
 
 def _write_toss(
@@ -62,7 +59,7 @@ def _write_toss(
         notes.append("cam_K.txt has no place for lens distortion: images are kept as they are, distorted")
     for name in ("rgb", "depth", "masks"):
         (folder / name).mkdir(parents=True)
-    (folder / "cam_K.txt").write_text(camera_text(camera))
+    (folder / "cam_K.txt").write_text("".join(" ".join(map(repr, row)) + "\n" for row in camera.K.tolist()))
     colors, frames = toss.color(CAMERA), toss.rgbd(CAMERA)
     depths, exact = toss.depth(CAMERA), _depth_is_exact(toss)
     position = {time_ns: k for k, time_ns in enumerate(depths.times_ns.tolist())}
@@ -82,10 +79,6 @@ def _write_toss(
             (folder / "masks" / f"{name}.png").write_bytes(encode_mask(masks[i]))
     if not exact:
         notes.append("depth was converted to millimetres, aligned to colour: what was finer is rounded")
-
-
-def camera_text(camera: CameraModel) -> str:
-    return "".join(" ".join(map(repr, row)) + "\n" for row in camera.K.tolist())
 
 
 def _depth_is_exact(toss: Toss) -> bool:

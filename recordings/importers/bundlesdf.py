@@ -105,12 +105,7 @@ def _list_toss(number: int, folder: Path, warnings: Warnings) -> _Toss:
     color, depth = common.listed(folder / "rgb", IMAGE_SUFFIXES), common.listed(folder / "depth", (".png",))
     if not color:
         raise BadInput(f"{folder / 'rgb'} is empty; wanted images named 000000.png, 000001.png, ...")
-    alone = sorted({int(p.stem) for p in color} ^ {int(p.stem) for p in depth})
-    if alone:
-        raise BadInput(
-            f"{folder}: {len(color)} colour and {len(depth)} depth images; frame {alone[0]} is only in one of "
-            "rgb/ and depth/"
-        )
+    common.same_frames(folder, color, depth)
     header = read_header(common.read_bytes(color[0]), str(color[0]))
     K = _camera_matrix(folder / "cam_K.txt")
     camera = CameraModel("d455", header.width, header.height, K)

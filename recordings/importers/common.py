@@ -142,6 +142,16 @@ def listed(folder: Path, suffixes: Sequence[str]) -> list[Path]:
     return sorted(files, key=lambda f: int(f.stem))
 
 
+def same_frames(folder: Path, color: Sequence[Path], depth: Sequence[Path], wanted: str = "") -> None:
+    """Raises BadInput where a frame is not among both colour and depth images; `wanted`: what to do then."""
+    alone = sorted({int(p.stem) for p in color} ^ {int(p.stem) for p in depth})
+    if alone:
+        raise BadInput(
+            f"{folder}: {len(color)} colour and {len(depth)} depth images; frame {alone[0]} is only in one of "
+            f"rgb/ and depth/{wanted}"
+        )
+
+
 def read_stamps_ns(path: Path) -> Int64[Array, " n"]:
     """timestamps.txt: seconds, one per line, to whole nanoseconds without passing through a float. Strictly growing."""
     times = [

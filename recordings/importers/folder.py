@@ -7,7 +7,7 @@ file's info, so that the clock grows over the session; `export folder` takes the
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -31,6 +31,8 @@ from recordings.session_writer import SessionWriter
 ARM_JOINTS = {"franka_panda": tuple(f"panda_joint{i}" for i in range(1, 8))}
 ARM_BATCH = 50
 VIEW_STEP_NS = 1_000_000_000
+OWN_TIMES = ". Wanted the same numbers in both, or depth_timestamps.txt with one time per depth image"
+"""Without own times a depth image belongs to the colour image of its number."""
 CLOCK = "every toss has its own clock starting at 0; toss k starts at clock_offset_ns of its file"
 
 
@@ -123,7 +125,7 @@ def _list_toss(folder: Path, number: int, layout: Layout, warnings: Warnings) ->
     if own_times.exists():
         depth_ns = _stamps(own_times, len(depth), "depth images")
     else:
-        _same_frames(folder, color, depth)
+        common.same_frames(folder, color, depth, OWN_TIMES)
         depth_ns = color_ns
     mono = _list_mono(layout, folder.name)
     about = common.read_json_object(folder / "toss.json") if (folder / "toss.json").exists() else {}
@@ -147,17 +149,6 @@ def _stamps(path: Path, count: int, what: str) -> Int64[Array, " n"]:
     if len(times_ns) != count:
         raise BadInput(f"{path} has {len(times_ns)} lines for {count} {what}; wanted one time per image")
     return times_ns
-
-
-def _same_frames(folder: Path, color: Sequence[Path], depth: Sequence[Path]) -> None:
-    """Without own times a depth image belongs to the colour image of its number."""
-    missing = sorted({int(p.stem) for p in color} ^ {int(p.stem) for p in depth})
-    if missing:
-        raise BadInput(
-            f"{folder}: {len(color)} colour and {len(depth)} depth images; frame {missing[0]} is only in one of "
-            "rgb/ and depth/. "
-            "Wanted the same numbers in both, or depth_timestamps.txt with one time per depth image"
-        )
 
 
 def _list_mono(layout: Layout, toss: str) -> dict[str, _Images]:
@@ -263,15 +254,9 @@ def _depths_in_time(
 def _arm_in_time(t: TossWriter, arm: ArmStates | None, offset_ns: int) -> Iterator[Timed]:
     if arm is None:
         return
+    arm = replace(arm, time_ns=arm.time_ns + offset_ns)
     for i in range(0, len(arm.time_ns), ARM_BATCH):
-        part = slice(i, i + ARM_BATCH)
-        batch = ArmStates(
-            arm.time_ns[part] + offset_ns,
-            arm.joint_names,
-            arm.q_rad[part],
-            arm.dq_rad_s[part],
-            arm.finger_width_m[part],
-        )
+        batch = arm.part(slice(i, i + ARM_BATCH))
         yield int(batch.time_ns[0]), partial(t.arm, batch)
 
 

@@ -14,8 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Int64
-from numpy import ndarray as Array
 
 from recordings.errors import BadInput
 from recordings.geometry import CameraModel
@@ -26,7 +24,7 @@ from recordings.importers.ros_messages import Pixels, color_image, depth_image, 
 from recordings.importers.ros_topics import Topics, choose, describe
 from recordings.mcap.toss_writer import TossWriter
 from recordings.progress import Progress, Silent
-from recordings.records import ArmStates, DepthImage, EncodedImage
+from recordings.records import DepthImage, EncodedImage
 from recordings.tracks import RigCalibration
 
 FLOAT_DEPTH_UNIT_M = 0.00025
@@ -131,12 +129,4 @@ def _arm(toss: TossWriter, bag: Bag, topic: str, warnings: Warnings) -> Iterator
         return
     stamps = common.growing(states.time_ns, f"{bag.path.name}: {topic}")
     for i in range(0, len(stamps), ARM_BATCH):
-        batch = _slice(states, slice(i, i + ARM_BATCH))
-        yield int(received[i]), partial(toss.arm, batch)
-
-
-def _slice(states: ArmStates, part: slice) -> ArmStates:
-    times_ns: Int64[Array, " n"] = states.time_ns[part]
-    return ArmStates(
-        times_ns, states.joint_names, states.q_rad[part], states.dq_rad_s[part], states.finger_width_m[part]
-    )
+        yield int(received[i]), partial(toss.arm, states.part(slice(i, i + ARM_BATCH)))

@@ -59,7 +59,7 @@ def recover_file(source: Path, out: Path) -> Recovered:
         if file.size == 0:
             raise BadInput(f"{source} is empty (0 bytes): there is nothing to recover")
         found = survey(file)
-        if not found.offsets and not _begins_as_mcap(file):
+        if not found.offsets and not MAGIC.startswith(file.read(0, 8)):
             raise BadInput(f"{source} is not an MCAP file: it begins with {file.read(0, 8)!r} and holds no whole chunk")
         try:
             with McapWriter(out, found.profile, found.library or "tosslab recover") as writer:
@@ -67,10 +67,6 @@ def recover_file(source: Path, out: Path) -> Recovered:
         except (WriteFailed, DamagedFile):
             out.unlink(missing_ok=True)
             raise
-
-
-def _begins_as_mcap(file: Bytes) -> bool:
-    return MAGIC.startswith(file.read(0, 8))
 
 
 class _Rewriting:

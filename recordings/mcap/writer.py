@@ -140,7 +140,7 @@ class McapWriter:
         with self._lock:
             self._sink.check()
             if channel not in self._chunk.index:
-                self._chunk.add_definition(self._definitions[channel])
+                self._chunk.append(self._definitions[channel])
             self._chunk.add_message(channel, log_time_ns, publish_time_ns, sequence & 0xFFFFFFFF, data, compress)
             self._accepted[channel] += 1
             if self._chunk.full():
@@ -320,9 +320,6 @@ class _Chunk:
         self.compress = False
         self.opened_s = time.monotonic()
 
-    def add_definition(self, record: bytes) -> None:
-        self._append(record)
-
     def add_message(
         self, channel: int, log_ns: int, publish_ns: int, sequence: int, data: bytes, compress: bool
     ) -> None:
@@ -331,10 +328,10 @@ class _Chunk:
         self.last_ns = max(self.last_ns, log_ns) if self.index else log_ns
         self.index.setdefault(channel, []).append((log_ns, self.size))
         self.compress |= compress
-        self._append(head)
-        self._append(data)
+        self.append(head)
+        self.append(data)
 
-    def _append(self, part: bytes) -> None:
+    def append(self, part: bytes) -> None:
         if self.size == 0:
             self.opened_s = time.monotonic()
         self.parts.append(part)

@@ -5,8 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Int
-from numpy import ndarray as Array
 
 from recordings.errors import BadInput
 from recordings.results.stage_files import stage_document, stage_file
@@ -74,8 +72,4 @@ def obj_text(shape: ObjectShape) -> str:
     colour = "" if shape.vertex_rgb is None else " %.4f %.4f %.4f"
     rows = shape.vertices_m if shape.vertex_rgb is None else np.hstack([shape.vertices_m, shape.vertex_rgb / 255.0])
     vertices = "\n".join(("v %.9g %.9g %.9g" + colour) % tuple(row) for row in rows)
-    return vertices + "\n" + _faces(shape.faces)
-
-
-def _faces(faces: Int[Array, "f 3"]) -> str:
-    return "".join(f"f {a} {b} {c}\n" for a, b, c in faces + 1)
+    return vertices + "\n" + "".join(f"f {a} {b} {c}\n" for a, b, c in shape.faces + 1)

@@ -118,7 +118,7 @@ class _Content:
             (f"/{camera}/color", self.toss.color(camera)),
             (f"/{camera}/image", self.toss.mono(camera)),
         ):
-            for i in _spread(len(frames)):
+            for i in _sampled(len(frames)):
                 if not self._may_look(frames[i].width * frames[i].height):
                     return
                 try:
@@ -156,7 +156,7 @@ class _Content:
             return
         yield from self._pairs(camera, colors.times_ns, depths.times_ns)
         try:
-            images = [depths[i] for i in _spread(len(depths))]
+            images = [depths[i] for i in _sampled(len(depths))]
         except TosslabError as wrong:
             yield self._finding("error", f"/{camera}/depth: {wrong}")
             return
@@ -283,7 +283,7 @@ def _plane_depth(lens: CameraModel, normal: Float[Array, "3"], height_m: float) 
     return np.where(np.isfinite(depth_m) & (depth_m > 0), depth_m, 0.0)
 
 
-def _spread(count: int) -> list[int]:
+def _sampled(count: int) -> list[int]:
     return sorted({int(i) for i in np.linspace(0, count - 1, min(count, LOOKED_AT))}) if count else []
 
 

@@ -12,7 +12,7 @@ from numpy import ndarray as Array
 from recordings.geometry import CameraModel, Transform, rotation_angle_rad
 from recordings.tracks import TagPlacement, runs
 from recordings.view.body_point import at_same_point
-from recordings.view.layers import CAMERA, MOTION, Clock, Look, image_entity, plotted, quaternions_xyzw
+from recordings.view.layers import CAMERA, FRUSTUM_M, MOTION, Clock, image_entity, plotted, quaternions_xyzw
 from recordings.view.mesh import outline_px, shaded_mesh
 from recordings.view.scene import Body, Color, Scene, root_poses
 
@@ -25,7 +25,7 @@ AXES_M = 0.06
 AXES_COLORS: tuple[Color, ...] = ((255, 80, 90), (60, 180, 90), (110, 120, 255))
 
 
-def log_rig(recording: rr.RecordingStream, scene: Scene, look: Look) -> None:
+def log_rig(recording: rr.RecordingStream, scene: Scene) -> None:
     """The world's axes, cameras with their frusta, the table's tags in the world and in the images."""
     upright = rr.ViewCoordinates.RIGHT_HAND_Z_UP if scene.root == "world" else rr.ViewCoordinates.RDF
     recording.log("world", upright, static=True)
@@ -33,11 +33,11 @@ def log_rig(recording: rr.RecordingStream, scene: Scene, look: Look) -> None:
         recording.log("world/origin", rr.TransformAxes3D(0.1), static=True)
     for name, model in scene.calibration.cameras.items():
         if not name.endswith("_depth"):
-            log_camera(recording, scene, name, model, look)
+            log_camera(recording, scene, name, model)
     log_table_tags(recording, scene)
 
 
-def log_camera(recording: rr.RecordingStream, scene: Scene, name: str, model: CameraModel, look: Look) -> None:
+def log_camera(recording: rr.RecordingStream, scene: Scene, name: str, model: CameraModel) -> None:
     """A frustum with its image at the camera's place; without a place the image is shown flat only."""
     place = scene.root_from(model.frame)
     if place is None:
@@ -50,7 +50,7 @@ def log_camera(recording: rr.RecordingStream, scene: Scene, name: str, model: Ca
         image_from_camera=model.K,
         width=model.width,
         height=model.height,
-        image_plane_distance=look.frustum_m,
+        image_plane_distance=FRUSTUM_M,
         color=color,
     )
     recording.log(image_entity(scene, name), pinhole, static=True)

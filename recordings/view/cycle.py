@@ -176,14 +176,11 @@ def log_judged(clock: Clock, body: Body, step: Step, color: Color) -> None:
             continue
         times_ns = step.track.time_ns[judged.position]
         dimmed: Color = color if not kind else (color[0] // 2, color[1] // 2, color[2] // 2)
-        for name, values in figures_of(judged).items():
+        figures = {"depth_mm": 1e3 * judged.depth_m, "outline": judged.mask, "colour": judged.color}
+        for name, values in figures.items():
             log_line(
                 clock, f"{name}/{body.name}/{slug(step.label + kind)}", step.label + kind, dimmed, times_ns, values
             )
-
-
-def figures_of(judged: Judged) -> dict[str, Float[Array, " k"]]:
-    return {"depth_mm": 1e3 * judged.depth_m, "outline": judged.mask, "colour": judged.color}
 
 
 def log_line(

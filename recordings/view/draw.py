@@ -20,7 +20,7 @@ from recordings.view.blueprint import ABOUT, about_text, blueprint
 from recordings.view.bodies import log_bodies, log_rig
 from recordings.view.cycle import log_cycle
 from recordings.view.drawn import drawn_picture
-from recordings.view.layers import EVENTS, TIME, Clock, Look, Steps, log_toss
+from recordings.view.layers import EVENTS, TIME, Clock, Steps, log_toss
 from recordings.view.rrd_file import PipedFile
 from recordings.view.scene import Scene, moment_ns, result_bodies, results_scene, session_scene
 from recordings.view.track import log_tracking
@@ -30,7 +30,7 @@ from recordings.whole_file import write_bytes
 
 APPLICATION = "tosslab"
 RRD_MAGIC = b"RRF2"
-LOOK, SILENT = Look(), Silent()
+SILENT = Silent()
 NO_DRIVER = "there is no graphics driver (Mesa's: `apt-get install -y libvulkan1 mesa-vulkan-drivers`)"
 DRAWN = "so the picture is drawn in software, without plots and clouds"
 LEFT_OUT = "so the picture is left out: without one, only the colour images of a session can be drawn on"
@@ -53,7 +53,7 @@ class Shot:
     said: str = ""
 
 
-def save_rrd(path: Path, out: Path, choice: Choice = Choice(), look: Look = LOOK, progress: Progress = SILENT) -> None:
+def save_rrd(path: Path, out: Path, choice: Choice = Choice(), progress: Progress = SILENT) -> None:
     """Write what `toss-view PATH` shows to an .rrd file, whole or not at all.
 
     A foreign .mcap goes through rerun's own loader.
@@ -71,7 +71,7 @@ def save_rrd(path: Path, out: Path, choice: Choice = Choice(), look: Look = LOOK
         if scene is None:
             run_rerun("mcap", "convert", str(path), "-o", str(partial))
         else:
-            _write(scene, partial, look, progress)
+            _write(scene, partial, progress)
         partial.replace(out)
     except OSError as refused:
         raise WriteFailed(f"{out} cannot be written: {refused.strerror}") from refused
@@ -80,20 +80,18 @@ def save_rrd(path: Path, out: Path, choice: Choice = Choice(), look: Look = LOOK
             partial.unlink(missing_ok=True)
 
 
-def _write(scene: Scene, out: Path, look: Look, progress: Progress) -> None:
+def _write(scene: Scene, out: Path, progress: Progress) -> None:
     recording = _recording(scene)
     file = PipedFile(out)
     try:
         recording.save(file.path, default_blueprint=blueprint(scene))
-        fill(recording, scene, look, progress)
+        fill(recording, scene, progress)
     finally:
         recording.disconnect()
         file.close()
 
 
-def screenshot(
-    path: Path, out: Path, choice: Choice = Choice(), look: Look = LOOK, size: tuple[int, int] = (1280, 800)
-) -> Shot:
+def screenshot(path: Path, out: Path, choice: Choice = Choice(), size: tuple[int, int] = (1280, 800)) -> Shot:
     """Write a PNG of the viewer's window at a telling moment of the first toss (the middle of its flight).
 
     No display is needed. Without a graphics driver the moment is drawn in software, or left out where the path is not
@@ -102,7 +100,7 @@ def screenshot(
     scene = None if is_foreign(path) else open_scene(path, choice)
     said, picture = "", None
     try:
-        picture = _viewed(path, scene, look, size)
+        picture = _viewed(path, scene, size)
     except NoGraphics:
         picture = None if scene is None else drawn_picture(scene, scene.tosses[0])
         said = f"{NO_DRIVER}, {LEFT_OUT if picture is None else DRAWN}"
@@ -112,21 +110,21 @@ def screenshot(
     return Shot(picture is not None, said)
 
 
-def _viewed(path: Path, scene: Scene | None, look: Look, size: tuple[int, int]) -> bytes:
+def _viewed(path: Path, scene: Scene | None, size: tuple[int, int]) -> bytes:
     """The viewer's picture of a scene, or of a file that is not ours."""
     with Viewer(headless=True, size=size) as viewer:
         if scene is None:
             viewer.client.open(str(path.resolve()))
         else:
             toss = scene.tosses[0]
-            stream(scene, viewer, look, tosses=(toss,))
+            stream(scene, viewer, tosses=(toss,))
             shift_ns = scene.shift_ns[toss]
             viewer.wait_for(TIME, scene.spans_ns[toss][1] + shift_ns)
             viewer.show(TIME, moment_ns(scene, toss) + shift_ns)
         return viewer.picture()
 
 
-def open_viewer(path: Path, choice: Choice = Choice(), look: Look = LOOK, progress: Progress = SILENT) -> None:
+def open_viewer(path: Path, choice: Choice = Choice(), progress: Progress = SILENT) -> None:
     """Open the viewer's window and stay until it is closed. Raises ViewerFailed where there is no display."""
     scene = None if is_foreign(path) else open_scene(path, choice)
     if not has_display():
@@ -139,21 +137,15 @@ def open_viewer(path: Path, choice: Choice = Choice(), look: Look = LOOK, progre
         if scene is None:
             viewer.client.open(str(path.resolve()))
         else:
-            stream(scene, viewer, look, progress)
+            stream(scene, viewer, progress)
         viewer.wait_until_closed()
 
 
-def stream(
-    scene: Scene,
-    viewer: Viewer,
-    look: Look = LOOK,
-    progress: Progress = SILENT,
-    tosses: tuple[int, ...] | None = None,
-) -> None:
+def stream(scene: Scene, viewer: Viewer, progress: Progress = SILENT, tosses: tuple[int, ...] | None = None) -> None:
     """Send a scene, or some tosses of it, to a running viewer; returns when all of it has arrived."""
     recording = _recording(scene)
     recording.connect_grpc(viewer.url, default_blueprint=blueprint(scene))
-    fill(recording, scene, look, progress, tosses)
+    fill(recording, scene, progress, tosses)
     recording.disconnect()
 
 
@@ -193,15 +185,11 @@ def is_rrd(path: Path) -> bool:
 
 
 def fill(
-    recording: rr.RecordingStream,
-    scene: Scene,
-    look: Look,
-    progress: Progress,
-    tosses: tuple[int, ...] | None = None,
+    recording: rr.RecordingStream, scene: Scene, progress: Progress, tosses: tuple[int, ...] | None = None
 ) -> None:
     """Log a scene (or some tosses of it) toss by toss, so that a live viewer has the first one at once."""
     recording.log(ABOUT, rr.TextDocument(about_text(scene), media_type=rr.MediaType.MARKDOWN), static=True)
-    log_rig(recording, scene, look)
+    log_rig(recording, scene)
     robot = known_arm(scene)
     if robot is not None:
         log_arm_model(recording, robot)
@@ -219,7 +207,7 @@ def fill(
             log_cycle(clock, scene, body)
         if robot is not None:
             log_arm_motion(recording, scene, robot, toss)
-        log_toss(recording, scene, toss, look, steps)
+        log_toss(recording, scene, toss, steps)
         flush(recording)  # the end is the last to arrive: who sees it has all of the toss
         clock.at(end_ns).log(EVENTS, rr.TextLog(f"toss {toss}: recording ends"))
         flush(recording)

@@ -13,7 +13,7 @@ from recordings.errors import BadInput, DamagedFile
 from recordings.geometry import CameraModel, Transform, quaternion_from_rotation
 from recordings.mcap.codec import decode_image
 from recordings.progress import Progress
-from recordings.records import DepthImage, EncodedImage, HealthLine, RgbdFrame
+from recordings.records import DepthImage, EncodedImage, RgbdFrame
 from recordings.session import Toss
 from recordings.view.scene import Scene
 
@@ -21,21 +21,15 @@ TIME, TOSS = "time", "toss"
 CAMERA, FLAT, DEPTH, CLOUD = "world/cameras/{}", "flat/{}", "depth/{}", "world/seen_by/{}"
 ARM, FRAMES, MOTION, EVENTS, HEALTH = "arm", "frames", "object", "events", "health"
 JPEG_QUALITY = 90
+CLOUD_POINTS = 20_000
+"""Largest number of points of one point cloud; the pixel grid is thinned evenly to stay below."""
+CLOUD_REACH_M = 2.5
+"""Depth beyond this is not drawn: walls would hide the table."""
+CLOUD_FILL = 0.7
+"""Drawn radius of a point in half distances to its neighbour: 1 closes a wall that faces the camera."""
+FRUSTUM_M = 0.12
+"""Length of a drawn camera frustum."""
 LEVELS = {"info": rr.TextLogLevel.INFO, "warning": rr.TextLogLevel.WARN, "error": rr.TextLogLevel.ERROR}
-
-
-@dataclass(frozen=True)
-class Look:
-    """How much is drawn."""
-
-    cloud_points: int = 20_000
-    """Largest number of points of one point cloud; the pixel grid is thinned evenly to stay below."""
-    cloud_reach_m: float = 2.5
-    """Depth beyond this is not drawn: walls would hide the table."""
-    cloud_fill: float = 0.7
-    """Drawn radius of a point in half distances to its neighbour: 1 closes a wall that faces the camera."""
-    frustum_m: float = 0.12
-    """Length of a drawn camera frustum."""
 
 
 class Clock:
@@ -78,7 +72,7 @@ class Steps:
         self._progress.step(self._done, self._total, note)
 
 
-def log_toss(recording: rr.RecordingStream, scene: Scene, toss: int, look: Look, steps: Steps) -> None:
+def log_toss(recording: rr.RecordingStream, scene: Scene, toss: int, steps: Steps) -> None:
     """Everything that was recorded in one toss."""
     recorded = scene.toss(toss)
     if recorded is None:
@@ -88,7 +82,7 @@ def log_toss(recording: rr.RecordingStream, scene: Scene, toss: int, look: Look,
         log_images(clock, scene, recorded, camera)
     if len(recorded.color()) and len(recorded.depth()):
         log_depth(clock, recorded)
-        log_cloud(clock, scene, recorded, look, steps)
+        log_cloud(clock, scene, recorded, steps)
     log_arm(clock, recorded)
     log_frame_times(clock, recorded)
     log_words(clock, recorded)
@@ -135,7 +129,7 @@ def drawn_depth(image: DepthImage) -> rr.DepthImage:
     return rr.DepthImage(image.raw, meter=1.0 / image.unit_m, depth_range=(0.2 / image.unit_m, 2.0 / image.unit_m))
 
 
-def log_cloud(clock: Clock, scene: Scene, toss: Toss, look: Look, steps: Steps, camera: str = "d455") -> None:
+def log_cloud(clock: Clock, scene: Scene, toss: Toss, steps: Steps, camera: str = "d455") -> None:
     """The coloured point cloud of every frame at the time its depth was exposed, in the root frame.
 
     Computed here through the lens model: rerun's pinhole knows no distortion. Left out where the camera's model or
@@ -145,11 +139,11 @@ def log_cloud(clock: Clock, scene: Scene, toss: Toss, look: Look, steps: Steps, 
     root_from_camera = scene.root_from(model.frame) if model is not None else None
     if model is None or root_from_camera is None:
         return
-    thin = Thinned.of(model, look.cloud_points)
+    thin = Thinned.of(model, CLOUD_POINTS)
     frames = toss.rgbd(camera)
     try:
         for frame in frames:
-            clock.at(frame.depth_time_ns).log(CLOUD.format(camera), thin.cloud(frame, root_from_camera, look))
+            clock.at(frame.depth_time_ns).log(CLOUD.format(camera), thin.cloud(frame, root_from_camera))
             steps.next(f"toss {clock.toss}")
     except DamagedFile:
         raise
@@ -172,17 +166,17 @@ class Thinned:
         u, v = np.meshgrid(np.arange(0, model.width, step), np.arange(0, model.height, step))
         return Thinned(step, step / model.fx, model.rays(np.stack([u, v], -1).astype(np.float64)))
 
-    def points(self, frame: RgbdFrame, reach_m: float) -> tuple[Float[Array, "n 3"], UInt8[Array, "n 3"]]:
+    def points(self, frame: RgbdFrame) -> tuple[Float[Array, "n 3"], UInt8[Array, "n 3"]]:
         """Points in the optical frame and colours; without pixels that have no depth, no ray, or lie beyond reach."""
         depth_m = frame.depth_m[:: self.step, :: self.step]
-        keep = (depth_m > 0) & (depth_m < reach_m) & np.isfinite(self.rays).all(axis=-1)
+        keep = (depth_m > 0) & (depth_m < CLOUD_REACH_M) & np.isfinite(self.rays).all(axis=-1)
         points = self.rays[keep] * depth_m[keep][:, None].astype(np.float64)
         return points, frame.color_rgb[:: self.step, :: self.step][keep]
 
-    def cloud(self, frame: RgbdFrame, root_from_camera: Transform, look: Look) -> rr.Points3D:
+    def cloud(self, frame: RgbdFrame, root_from_camera: Transform) -> rr.Points3D:
         """The frame's point cloud in the root frame; points grow with their distance to their neighbours."""
-        points, colors = self.points(frame, look.cloud_reach_m)
-        radii = 0.5 * look.cloud_fill * self.spread * points[:, 2]
+        points, colors = self.points(frame)
+        radii = 0.5 * CLOUD_FILL * self.spread * points[:, 2]
         return rr.Points3D(short(root_from_camera.points(points)), colors=colors, radii=short(radii))
 
 
@@ -244,8 +238,4 @@ def log_words(clock: Clock, toss: Toss) -> None:
         text = f"toss {clock.toss}: the arm is told to release at {speed:.2f} m/s"
         clock.at(command.time_ns).log(EVENTS, rr.TextLog(text, level=rr.TextLogLevel.INFO))
     for line in toss.health():
-        clock.at(line.time_ns).log(HEALTH, health_entry(line))
-
-
-def health_entry(line: HealthLine) -> rr.TextLog:
-    return rr.TextLog(f"{line.name}: {line.message}", level=LEVELS[line.level])
+        clock.at(line.time_ns).log(HEALTH, rr.TextLog(f"{line.name}: {line.message}", level=LEVELS[line.level]))

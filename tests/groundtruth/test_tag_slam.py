@@ -210,7 +210,7 @@ def test_small_tags_start_nothing():
     assert 2 not in run_tag_slam(config, recording).tags
 
 
-# median reprojection of TagSLAM's own reference poses in px (data/README.md, section 3)
+# median reprojection of TagSLAM's own reference poses in px (README of the data, section 3)
 REFERENCE_PX = {"01": 0.39, "02": 0.34, "07": 0.97, "16": 0.07, "17": 0.08, "23": 0.34}
 SLOW = ("02", "07", "11")
 

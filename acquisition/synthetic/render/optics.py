@@ -244,11 +244,11 @@ def nearest(
         found = cast(one, np.broadcast_to(view.origin_m, (len(rows), 3)), rays[rows])
         nearer = found["t_hit"] < z[rows]
         z[rows[nearer]], owner[rows[nearer]] = found["t_hit"][nearer], number
-        answers.append(_spread(found, rows, len(rays)))
+        answers.append(_at_rows(found, rows, len(rays)))
     return z, owner, answers
 
 
-def _spread(found: dict[str, Array], rows: Array, count: int) -> dict[str, Array]:
+def _at_rows(found: dict[str, Array], rows: Array, count: int) -> dict[str, Array]:
     if len(rows) == count:
         return found
     spread = {}
@@ -307,7 +307,7 @@ def _instant(
     seen = still.radiance[box.slices].reshape(-1, 3).copy()
     _cast_shadows(seen, view, still, light, placed, box, lamps)
     rays = view.jittered(box, *jitter)
-    z, owner, hits = nearest(placed, view, rays, [_rows(view, one, box) for one in placed])
+    z, owner, hits = nearest(placed, view, rays, [_rows_in(_box_of(view, one).cut(box), box) for one in placed])
     hidden = z > still.depth_m[box.slices].reshape(-1) + BEHIND_SLACK_M
     owner[hidden] = -1
     rows_of = [np.flatnonzero(owner == number) for number in range(len(placed))]
@@ -337,10 +337,6 @@ def _cast_shadows(
             rows = rows[~dark[rows] & (np.abs(points[rows, 2]) < TABLE_REGION_M)]
             dark[rows] = occluded([one], points[rows], lamp_m, None)
         seen[dark] -= part[box.slices].reshape(-1, 3)[dark]
-
-
-def _rows(view: View, one: Placed, box: Box) -> Array:
-    return _rows_in(_box_of(view, one).cut(box), box)
 
 
 def _rows_in(inner: Box, outer: Box) -> Array:

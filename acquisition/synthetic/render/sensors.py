@@ -97,8 +97,8 @@ class DepthSensor:
         disparity = (config.stereo_focal_px * config.baseline_m / exact).astype(np.float32)
         shadow = self._shadow(disparity)
         smeared, dropped = self._edges(disparity, manner, rng)
-        if manner.filled_shadow > 0:
-            smeared, shadow = self._fill(smeared, shadow, manner, rng)
+        if manner.filled_shadow > 0:  # a dense preset invents what lies there: the ground, here what is really there
+            shadow = shadow & (_level(_smooth(rng, shadow.shape, 3 * self._scale)) >= manner.filled_shadow)
         tilt = np.clip(1.0 / np.maximum(facing, 0.25), 1.0, 2.5)
         noisy = smeared + self._noise(rng, disparity.shape) * weakness * np.sqrt(tilt)
         noisy = np.round(noisy / config.quantum_px) * config.quantum_px
@@ -138,13 +138,6 @@ class DepthSensor:
         out = np.where(flying, mix * nearest + (1 - mix) * cv2.erode(disparity, kernel), out)
         dropped = band & ~flying & (_level(_smooth(rng, disparity.shape, 0.8 * self._scale)) < manner.dropped)
         return out.astype(np.float32), dropped
-
-    def _fill(
-        self, disparity: Float32[Array, "h w"], shadow: Bool[Array, "h w"], manner: EdgeManner, rng: np.random.Generator
-    ) -> tuple[Float32[Array, "h w"], Bool[Array, "h w"]]:
-        """A dense preset invents what lies in the shadow: the ground to its left, here what is really there."""
-        kept = shadow & (_level(_smooth(rng, shadow.shape, 3 * self._scale)) >= manner.filled_shadow)
-        return disparity, kept
 
     def _holes(
         self, weakness: Float32[Array, "h w"], manner: EdgeManner, rng: np.random.Generator

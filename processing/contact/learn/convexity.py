@@ -120,9 +120,9 @@ def _tested_choice(
     for name in CLASSES:
         prior = measured_prior(name, shape, physics, *sigmas_m)
         found = learn_contact(learned, prior, physics, plane, quick)
-        prepared = prepare(held_out, found.frame, plane, found.fitted.inertia_start_kgm2)
+        prepared = prepare(held_out, found.frame, plane, found.fitted.inertia_kgm2)
         points = found.body().points_m.cpu().numpy()
-        each = losses_of(prepared, points, found.friction.value, found.fitted.inertia_start_kgm2)
+        each = losses_of(prepared, points, found.friction.value, found.fitted.inertia_kgm2)
         losses[name] = np.array([x.loss_j for x in each.values()])
     worse = losses["nonconvex"] - losses["hull"]
     standard_error = float(worse.std(ddof=1)) / len(worse) ** 0.5 if len(worse) > 1 else 0.0

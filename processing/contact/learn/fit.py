@@ -1,7 +1,6 @@
 """The parameter vector of a fit, and the optimisers: L-BFGS for a box, Adam with a cosine schedule for free points.
 
-Layout of a parameter vector: shape | square root of friction | inertia (6) | centre of mass (3) | plane (1);
-lengths in SCALE_M.
+Layout of a parameter vector: shape (lengths in SCALE_M) | square root of friction.
 """
 
 from __future__ import annotations
@@ -16,11 +15,9 @@ from numpy import ndarray as Array
 from torch import Tensor
 
 from processing.contact.physics.geometry import SCALE_M, Geometry
-from processing.contact.physics.inertia import inertia_from
 from processing.contact.physics.loss import Body, LossValue, StepData, Weights, contact_loss
-from recordings.errors import BadInput
 
-SHAPE, FRICTION, INERTIA, CENTER, PLANE = slice(None, -11), -11, slice(-10, -4), slice(-4, -1), -1
+SHAPE, FRICTION = slice(None, -1), -1
 """Where a parameter vector keeps what."""
 LOSS_SCALE = 1e4
 """Brings the loss (J) to order one for the optimisers' tolerances."""
@@ -35,13 +32,7 @@ MOST_MOVE, MOST_FRICTION = 1.5, 2.0
 
 @dataclass(frozen=True)
 class FitConfig:
-    learn_inertia: bool = False
-    """Inertia over mass, always physical."""
-    learn_center: bool = False
-    """The centre of mass against the prior's."""
     learn_shape: bool = True
-    learn_plane: bool = False
-    """Only where the shape is known: size and plane height together are not identifiable."""
     friction_start: float = 0.03
     lbfgs_iterations: int = 40
     """For a box."""
@@ -57,42 +48,23 @@ class FitConfig:
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """A geometry, the inertia that the fit starts from (at the reference mass) and what of them is learned."""
+    """A geometry, the body's inertia (at the reference mass) and what of the geometry is learned."""
 
     geometry: Geometry
-    inertia_start_kgm2: Float[Array, "3 3"]
+    inertia_kgm2: Float[Array, "3 3"]
     config: FitConfig
     sigma_m: Float[Array, " v"] | None = None
     """Free points that a prior holds: how far each may be off. None: nothing holds them."""
 
-    def __post_init__(self) -> None:
-        if self.config.learn_plane and self.config.learn_shape:
-            raise BadInput(
-                "the size of the object and the height of the plane cannot both be learned: raising the plane looks "
-                "like "
-                "shrinking the object; calibrate the plane (`toss-calibrate table SESSION`) or keep the shape fixed"
-            )
-
     def start(self) -> Float[Array, " p"]:
-        shape = self.geometry.start()
-        return np.concatenate([shape, [self.config.friction_start**0.5], np.zeros(10)])
+        return np.append(self.geometry.start(), self.config.friction_start**0.5)
 
     def learned(self) -> Bool[Array, " p"]:
-        count = len(self.geometry.start())
-        c = self.config
-        flags = [c.learn_shape] * count + [True] + [c.learn_inertia] * 6 + [c.learn_center] * 3 + [c.learn_plane]
-        return np.array(flags, dtype=bool)
+        return np.array([self.config.learn_shape] * len(self.geometry.start()) + [True])
 
     def body(self, parameters: Float[Tensor, " p"]) -> Body:
-        inertia0 = torch.as_tensor(self.inertia_start_kgm2, dtype=parameters.dtype, device=parameters.device)
-        inertia = inertia_from(parameters[INERTIA], inertia0) if self.config.learn_inertia else inertia0
-        return Body(
-            self.geometry.points(parameters[SHAPE]),
-            parameters[FRICTION].square(),
-            inertia,
-            SCALE_M * parameters[CENTER],
-            SCALE_M * parameters[PLANE],
-        )
+        inertia = torch.as_tensor(self.inertia_kgm2, dtype=parameters.dtype, device=parameters.device)
+        return Body(self.geometry.points(parameters[SHAPE]), parameters[FRICTION].square(), inertia)
 
     def numbers(self, parameters: Float[Array, " p"]) -> Body:
         """The body of a parameter vector, without gradients, on the fit's device."""
@@ -109,8 +81,7 @@ class Model:
         return HOLD_J / max(transitions, 1) * 0.5 * (move.square().sum(-1) / sigma.square()).sum()
 
     def loss(self, parameters: Float[Tensor, " p"], data: StepData, weights: Weights) -> LossValue:
-        idle = self.config.learn_inertia or self.config.learn_center
-        return contact_loss(data, self.body(parameters), self.geometry.contacts, weights, idle_gradient=idle)
+        return contact_loss(data, self.body(parameters), self.geometry.contacts, weights)
 
 
 @dataclass(frozen=True, eq=False)

@@ -132,7 +132,9 @@ def learn_from_series(
     learning = learn_contact(series, prior, physics, plane, alone, progress)
     _check_seen_rests(learning, shape, prior)
     surface = Surface(shape.vertices_m, shape.observed)
-    field_, readings, sizes = _field(learning, prior, surface, plane, config.fusion)
+    readings, plane_m = readings_of(learning, prior), config.fusion.plane_m if plane.std_m is None else plane.std_m
+    sizes = likely_sizes(readings, surface, config.fusion, plane_m)
+    field_ = Field(readings, sizes, config.fusion, surface, plane_m)
     moved = field_.at(shape.vertices_m)
     refined = ObjectShape(
         shape.object_frame, "contact", shape.vertices_m + moved, shape.faces, shape.vertex_rgb, shape.observed
@@ -224,15 +226,6 @@ def _compared(
     return Readings(prior.frame.back(at), direction @ axes.T, further, sigma)
 
 
-def _field(
-    learning: ContactLearning, prior: Prior, surface: Surface, plane: Plane, config: FusionConfig
-) -> tuple[Field, Readings, Sizes]:
-    readings = readings_of(learning, prior)
-    plane_m = config.plane_m if plane.std_m is None else plane.std_m
-    sizes = likely_sizes(readings, surface, config, plane_m)
-    return Field(readings, sizes, config, surface, plane_m), readings, sizes
-
-
 def _fused(
     learning: ContactLearning, prior: Prior, physics: Physics, plane: Plane, moves: Field, contact_config: ContactConfig
 ) -> ContactLearning:
@@ -240,9 +233,9 @@ def _fused(
     frame, geometry = prior.frame, learning.fitted.geometry
     start = frame.back(start_points(prior))
     points = frame.inside(start + moves.at(start))
-    config = replace(learning.fitted.config, learn_shape=False, learn_inertia=False, learn_center=False)
-    model = Model(FreePoints(points, geometry.pieces(), geometry.contacts), learning.fitted.inertia_start_kgm2, config)
-    begin = np.concatenate([points.ravel() / SCALE_M, learning.fit.parameters[FRICTION:]])
+    config = replace(learning.fitted.config, learn_shape=False)
+    model = Model(FreePoints(points, geometry.pieces(), geometry.contacts), learning.fitted.inertia_kgm2, config)
+    begin = np.append(points.ravel() / SCALE_M, learning.fit.parameters[FRICTION])
     found = fit_lbfgs(model, begin, learning.data, learning.weights, 20)
     slow = slow_friction(model, found.parameters, learning.prepared, contact_config)
     found, spread = with_friction(found, learning.spread, slow)
@@ -284,7 +277,7 @@ def _document(
 ) -> dict[str, Any]:
     """Everything a reader needs to judge it, as JSON values."""
     seen = np.ones(len(moved_m), dtype=bool) if shape.observed is None else shape.observed
-    inertia = learning.fitted.inertia_start_kgm2
+    inertia = learning.fitted.inertia_kgm2
     losses = {
         name: mean_loss_j(losses_of(learning.prepared, points, friction, inertia))
         for name, points, friction in (

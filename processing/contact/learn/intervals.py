@@ -18,12 +18,13 @@ from numpy import ndarray as Array
 from scipy.stats import t as student
 
 from processing.contact.learn.fit import FRICTION, SHAPE, Model, fit
-from processing.contact.physics.geometry import SCALE_M
 from processing.contact.physics.loss import StepData, Weights, contact_loss, idle_terms, step_terms
 
 PRIOR_FRICTION, PRIOR_SIZE_M = 0.3, 0.02
 """Standard deviations that nothing was learned from."""
 CONTACT_LASTS_S = 0.05
+REFIT_SHARE = 0.12
+"""Of the fit's iterations, for a repeat from the optimum."""
 DIFFERENCE_FRICTION, DIFFERENCE_SIZE = 0.02, 0.03
 """Steps of the numerical derivatives: of friction and of the relative size. They reach over the kinks of the loss,
 where another point becomes the lowest: closer by, a kink would pass for certainty."""
@@ -55,15 +56,12 @@ class Interval:
 
 @dataclass(frozen=True, eq=False)
 class Spread:
-    """95 % half widths: of friction, of the extents along the axes, of each point, of inertia and centre of mass
-    (NaN where it does not apply), and by which method."""
+    """95 % half widths: of friction, of the extents along the axes, of each point, and by which method."""
 
     method: str
     friction: float
     extents_m: Float[Array, "3"]
     points_m: Float[Array, "v 3"] | None
-    center_m: Float[Array, "3"]
-    inertia_relative: Float[Array, "6"]
 
 
 def extents(points_m: Float[Array, "v 3"]) -> Float[Array, "3"]:
@@ -72,13 +70,7 @@ def extents(points_m: Float[Array, "v 3"]) -> Float[Array, "3"]:
 
 
 def bootstrap(
-    model: Model,
-    optimum: Float[Array, " p"],
-    data: StepData,
-    weights: Weights,
-    repeats: int,
-    seed: int,
-    share: float = 0.12,
+    model: Model, optimum: Float[Array, " p"], data: StepData, weights: Weights, repeats: int, seed: int
 ) -> Spread:
     """Repeat the fit on tosses drawn with replacement."""
     rng = np.random.default_rng(seed)
@@ -88,7 +80,7 @@ def bootstrap(
         counts = rng.multinomial(len(tosses), np.full(len(tosses), 1 / len(tosses)))
         part = data.rows(torch.arange(len(data), device=data.weight.device))
         part.weight = data.weight * torch.as_tensor(counts[owner], dtype=torch.float64, device=data.weight.device)
-        drawn.append(fit(model, optimum, part, weights, share).parameters)
+        drawn.append(fit(model, optimum, part, weights, REFIT_SHARE).parameters)
     values = np.array(drawn)
     # n / (n - 1): drawing with replacement narrows the spread of small samples
     width = float(student.ppf(0.975, max(len(tosses) - 1, 1))) * (len(tosses) / max(len(tosses) - 1, 1)) ** 0.5
@@ -98,8 +90,6 @@ def bootstrap(
         float(np.hypot(width * (values[:, FRICTION] ** 2).std(ddof=1), 1.96 * MODEL_SHARE * optimum[FRICTION] ** 2)),
         width * np.array([extents(p) for p in points]).std(axis=0, ddof=1),
         width * points.std(axis=0, ddof=1),
-        width * SCALE_M * values[:, -4:-1].std(axis=0, ddof=1),
-        width * values[:, -10:-4].std(axis=0, ddof=1),
     )
 
 
@@ -127,8 +117,7 @@ def curvature(model: Model, optimum: Float[Array, " p"], data: StepData, weights
     model_error = np.array([MODEL_FRICTION] + [MODEL_SIZE] * 3)
     curved = float(student.ppf(0.975, freedom)) * np.sqrt(np.diag(covariance))
     width = np.sqrt(curved**2 + (1.96 * model_error) ** 2)
-    unknown = np.full(3, np.nan)
-    return Spread("curvature of the loss", float(width[0]), width[1:] * size, None, unknown, np.full(6, np.nan))
+    return Spread("curvature of the loss", float(width[0]), width[1:] * size, None)
 
 
 def _sandwich(
@@ -171,10 +160,9 @@ def _row_losses(
     return (out * data.weight).cpu().numpy()
 
 
-def plane_sensitivity(
-    fitted: Model, optimum: Float[Array, " p"], data: StepData, weights: Weights, shift_m: float = 0.001
-) -> dict[str, float]:
+def plane_sensitivity(fitted: Model, optimum: Float[Array, " p"], data: StepData, weights: Weights) -> dict[str, float]:
     """What the learned numbers do when the plane is 1 mm higher: metres (or friction) per metre."""
+    shift_m = 0.001
     low = data.rows(torch.arange(len(data), device=data.weight.device))
     low.position_m = data.position_m - data.position_m.new_tensor([0.0, 0.0, shift_m])
     moved = fit(fitted, optimum, low, weights, 0.3).parameters

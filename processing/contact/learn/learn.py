@@ -1,4 +1,4 @@
-"""Contact learning: tracks and a prior shape in, geometry, friction (inertia, centre of mass) with intervals out."""
+"""Contact learning: tracks and a prior shape in, geometry and friction with intervals out."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from processing.contact.learn.touch import plane_by_touch
 from processing.contact.learn.unexplained import unexplained_rows
 from processing.contact.physics.geometry import GeometryName
 from processing.contact.physics.inertia import Physics
-from processing.contact.physics.loss import REFERENCE_MASS_KG, Body, StepData, Weights, contact_loss
+from processing.contact.physics.loss import REFERENCE_MASS_KG, Body, StepData, Weights, contact_loss, find_contacts
 from processing.contact.physics.plane import Plane
 from processing.motion.trajectory import PoseSeries, Steps
 from recordings.progress import Progress, Silent
@@ -51,8 +51,6 @@ class ContactConfig:
     bootstrap_repeats: int = 16
     rollout_steps: int = 80
     rollout_step_s: float = 1 / 148
-    smooth: bool = True
-    """False: raw differences of the poses."""
     seed: int = 0
 
 
@@ -110,8 +108,7 @@ def learn_contact(
 ) -> ContactLearning:
     """Learn geometry and friction from `world_from_object` tracks.
 
-    Raises BadInput for data that contradict themselves (see data_checks), for no contact, and for learning plane
-    and size.
+    Raises BadInput for data that contradict themselves (see data_checks), and for no contact.
     """
     began = time.perf_counter()
     plane, config, progress = plane or Plane(), config or ContactConfig(), progress or Silent()
@@ -121,7 +118,7 @@ def learn_contact(
     again = {t for group in groups for t in group[1:]}
     prepared = prepare([t for t in tracks if t.toss not in again], prior.frame, plane, inertia)
     found = _check_together(tracks, prepared, prior, inertia, fitted)
-    steps = transitions(prepared, config.smooth)
+    steps = transitions(prepared)
     _require_contact(fitted, steps, prepared)
     progress.step(1, 6, "data checked")
     sweep, weights = _choose_weights(fitted, steps, prepared, config, progress)
@@ -137,7 +134,10 @@ def learn_contact(
     cpu_seconds = time.process_time() - started
     progress.step(3, 6, "fitted")
     found |= _slow_plane(fitted, optimum, prepared, prior, slow, config.seed)
-    spread = _spread(fitted, optimum, data, weights, config, len(prepared.tracks))
+    if len(prepared.tracks) < 2 or config.bootstrap_repeats < 2:
+        spread = curvature(fitted, optimum, data, weights)
+    else:
+        spread = bootstrap(fitted, optimum, data, weights, config.bootstrap_repeats, config.seed)
     progress.step(4, 6, "intervals")
     sensitivity = plane_sensitivity(fitted, optimum, data, weights)
     progress.step(5, 6, "sensitivity")
@@ -145,7 +145,7 @@ def learn_contact(
     optimum = last.parameters
     body = fitted.numbers(optimum)
     touched = touched_points(fitted, body, data, weights)
-    _check_learned_plane(prepared, body)
+    checks.check_plane(_rest_heights(prepared, body.points_m.cpu().numpy()), "the learned shape")
     model, shape, friction, sizes = results_of(fitted, optimum, spread, prior, physics, plane, touched)
     left_out = {**prepared.left_out, **dict.fromkeys(sorted(again), "the same recording as another toss")}
     progress.step(6, 6, "learned")
@@ -214,10 +214,6 @@ def _rest_heights(prepared: Prepared, points_m: Float[Array, "v 3"]) -> dict[int
     return found
 
 
-def _check_learned_plane(prepared: Prepared, body: Body) -> None:
-    checks.check_plane(_rest_heights(prepared, body.points_m.cpu().numpy()), "the learned shape")
-
-
 def _require_contact(fitted: Model, steps: Steps, prepared: Prepared) -> None:
     """Raises BadInput where flight explains everything."""
     touching = [s for s in prepared.smoothed if not s.phases.in_flight.all()]
@@ -232,7 +228,7 @@ def _choose_weights(
         return None, config.weights
     if len(prepared.tracks) < 3:
         return None, Weights(dissipation=config.one_toss_dissipation, penetration=config.penetration)
-    start, begin = starts(prepared, config.rollout_step_s, fitted.inertia_start_kgm2)
+    start, begin = starts(prepared, config.rollout_step_s, fitted.inertia_kgm2)
     held_out = HeldOut(prepared.tracks, start, begin, config.rollout_steps, config.rollout_step_s)
     sweep = sweep_weights(
         fitted,
@@ -251,8 +247,7 @@ def slow_friction(
     """The friction by forecasts where it is better than the loss's; None where it is not, or not asked for."""
     if config.weights is not None or not config.friction_by_forecasts or not frames_are_slow(prepared.tracks):
         return None
-    rigid, tracks = _as_rigid(fitted, optimum, prepared)
-    return friction_by_forecasts(rigid, tracks, prepared.smoothed, config.seed)
+    return friction_by_forecasts(_as_rigid(fitted, optimum), prepared.tracks, prepared.smoothed, config.seed)
 
 
 def restitution_of(slow: ForecastFriction | None) -> Interval | None:
@@ -263,12 +258,10 @@ def restitution_of(slow: ForecastFriction | None) -> Interval | None:
     return Interval(value, max(value - half, 0.0), min(value + half, 1.0))
 
 
-def _as_rigid(fitted: Model, optimum: Float[Array, " p"], prepared: Prepared) -> tuple[RigidBody, list[PoseSeries]]:
-    """The learned body about its centre of mass, and the tracks of that point above the plane."""
+def _as_rigid(fitted: Model, optimum: Float[Array, " p"]) -> RigidBody:
+    """The learned body."""
     body = fitted.numbers(optimum)
-    center, inertia = body.center_m.cpu().numpy(), body.inertia_kgm2.cpu().numpy()
-    tracks = [t.about(center).turned(np.eye(3), float(body.plane_m)) for t in prepared.tracks]
-    return RigidBody(body.points_m.cpu().numpy() - center, fitted.geometry.contacts, inertia), tracks
+    return RigidBody(body.points_m.cpu().numpy(), fitted.geometry.contacts, body.inertia_kgm2.cpu().numpy())
 
 
 def _slow_plane(
@@ -283,8 +276,7 @@ def _slow_plane(
     BadInput as check_touched_plane does."""
     if slow is None or prior.measured or fitted.geometry.name != "box":
         return {}
-    rigid, tracks = _as_rigid(fitted, optimum, prepared)
-    plane = plane_by_forecasts(rigid, tracks, prepared.smoothed, slow.law, seed)
+    plane = plane_by_forecasts(_as_rigid(fitted, optimum), prepared.tracks, prepared.smoothed, slow.law, seed)
     if plane is None:
         return {}
     checks.check_touched_plane(plane.height_m, plane.std_m)
@@ -301,23 +293,8 @@ def with_friction(done: Fit, spread: Spread, slow: ForecastFriction | None) -> t
     return replace(done, parameters=parameters), replace(spread, method=method, friction=slow.half_width)
 
 
-def _spread(
-    fitted: Model,
-    optimum: Float[Array, " p"],
-    data: StepData,
-    weights: Weights,
-    config: ContactConfig,
-    tosses: int,
-) -> Spread:
-    if tosses < 2 or config.bootstrap_repeats < 2:
-        return curvature(fitted, optimum, data, weights)
-    return bootstrap(fitted, optimum, data, weights, config.bootstrap_repeats, config.seed)
-
-
 def touched_points(fitted: Model, body: Body, data: StepData, weights: Weights) -> Bool[Array, " v"]:
     """Points that carried an impulse, or were pushed out of the plane, in some transition that was learned from."""
-    from processing.contact.physics.loss import find_contacts
-
     impulses = contact_loss(data, body, fitted.geometry.contacts, weights).impulses
     found = find_contacts(data.rotation, data.position_m, body, fitted.geometry.contacts)
     carried = torch.zeros_like(found.height_m, dtype=torch.bool)
@@ -364,7 +341,7 @@ def results_of(
         friction_high=friction.high,
         mass_kg=physics.mass_kg,
         inertia_kgm2=frame.axes @ inertia @ frame.axes.T,
-        center_of_mass_m=frame.back(body.center_m.cpu().numpy()[None])[0],
+        center_of_mass_m=frame.back(np.zeros((1, 3)))[0],
         physics_source=physics.source,
         plane_normal_world=np.asarray(plane.normal_world, dtype=np.float64),
         plane_offset_m=plane.offset_m,

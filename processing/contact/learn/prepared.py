@@ -14,7 +14,7 @@ from processing.contact.learn.prior import Frame
 from processing.contact.physics.plane import Plane
 from processing.contact.physics.rollout import Start
 from processing.motion.smoother import Smoothed, smooth
-from processing.motion.trajectory import PoseSeries, States, Steps, differences, steps_of
+from processing.motion.trajectory import PoseSeries, States, Steps, steps_of
 from recordings.constants import GRAVITY_M_S2
 from recordings.errors import BadInput
 
@@ -76,10 +76,9 @@ def _start_row(states: States, frame: int, step_s: float, inertia: Float[Array, 
     )
 
 
-def transitions(prepared: Prepared, smoothed: bool = True) -> Steps:
+def transitions(prepared: Prepared) -> Steps:
     """Transitions from the release on: what a hand does is not learned."""
-    states = [s.states if smoothed else differences(t) for t, s in zip(prepared.tracks, prepared.smoothed)]
-    steps = steps_of(states)
+    steps = steps_of([s.states for s in prepared.smoothed])
     release = {s.states.toss: s.phases.release or 0 for s in prepared.smoothed}
     begin = np.array([release[t] for t in steps.toss.tolist()])
     return steps.only(steps.frame >= begin + 2)

@@ -88,7 +88,7 @@ def losses_of(
     def number(value: Any) -> torch.Tensor:
         return torch.as_tensor(np.asarray(value), dtype=torch.float64)
 
-    body = Body(number(points_m), number(friction), number(inertia_kgm2), number(np.zeros(3)), number(0.0))
+    body = Body(number(points_m), number(friction), number(inertia_kgm2))
     data = StepData(transitions(prepared))
     impulses = contact_loss(data, body, CONTACTS, weights).impulses
     names = ("prediction", "complementarity", "dissipation", "penetration")

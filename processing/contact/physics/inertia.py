@@ -1,4 +1,4 @@
-"""Mass, centre of mass and inertia: known or of uniform density, and a parameterisation that is always physical."""
+"""Mass, centre of mass and inertia: known or of uniform density."""
 
 from __future__ import annotations
 
@@ -6,10 +6,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import torch
 from jaxtyping import Float
 from numpy import ndarray as Array
-from torch import Tensor
 
 from recordings.errors import BadInput
 from recordings.tracks import ObjectShape
@@ -77,19 +75,3 @@ def uniform_box_physics(edges_m: Float[Array, "3"], mass_kg: float = 1.0) -> Phy
     square = np.asarray(edges_m, dtype=np.float64) ** 2
     inertia = np.diag(mass_kg / 12 * (square.sum() - square))
     return Physics(mass_kg, np.zeros(3), inertia, "unit mass, uniform density over the starting box")
-
-
-def inertia_from(parameters: Float[Tensor, "6"], start_kgm2: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"]:
-    """I = tr(S) 1 - S with S = L L', L = L0 E(parameters): every parameter vector is a body's inertia, 0 is the start.
-
-    S is the second moment of mass; the triangle inequality of the moments holds because S is positive definite.
-    """
-    eye = torch.eye(3, dtype=start_kgm2.dtype, device=start_kgm2.device)
-    second = 0.5 * torch.trace(start_kgm2) * eye - start_kgm2
-    floor = 1e-6 * torch.trace(second) * eye  # a flat body is a limit that Cholesky does not reach
-    change = torch.diag(torch.exp(parameters[:3])) + torch.zeros_like(eye).index_put(
-        (torch.tensor([1, 2, 2]), torch.tensor([0, 0, 1])), parameters[3:]
-    )
-    factor = torch.linalg.cholesky(second + floor) @ change
-    moved = factor @ factor.T - floor
-    return torch.trace(moved) * eye - moved

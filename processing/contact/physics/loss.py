@@ -62,14 +62,11 @@ class ContactTerms:
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """What a parameter vector stands for. Points and `center_m` are relative to the prior's centre of mass; the plane
-    lies `plane_m` above z = 0."""
+    """What a parameter vector stands for. Points are relative to the prior's centre of mass."""
 
     points_m: Float[Tensor, "v 3"]
     friction: Float[Tensor, ""]
     inertia_kgm2: Float[Tensor, "3 3"]
-    center_m: Float[Tensor, "3"]
-    plane_m: Float[Tensor, ""]
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,10 +110,8 @@ class StepData:
 
 @dataclass(frozen=True, eq=False)
 class FreeMotion:
-    """Velocities of the centre of mass after a step, and what flight does not explain: dv = v+ - (v + dt a_free)."""
+    """What flight does not explain of a step's change of velocity: dv = v+ - (v + dt a_free)."""
 
-    spin: Float[Tensor, "n 3"]
-    velocity: Float[Tensor, "n 3"]
     spin_change: Float[Tensor, "n 3"]
     velocity_change: Float[Tensor, "n 3"]
 
@@ -127,33 +122,22 @@ def free_motion(data: StepData, body: Body) -> FreeMotion:
     gyro = torch.linalg.cross(data.spin, data.spin @ body.inertia_kgm2)
     spin_free = -torch.linalg.solve(body.inertia_kgm2, gyro.T).T
     gravity = data.position_m.new_tensor([0.0, 0.0, -GRAVITY_M_S2])
-    velocity, before = data.velocity, data.velocity_before
-    if body.center_m.requires_grad or bool(body.center_m.any()):
-        velocity = velocity + _turn(data.rotation, torch.linalg.cross(data.spin, body.center_m.expand_as(data.spin)))
-        arm = body.center_m.expand_as(data.spin)
-        before = before + _turn(data.rotation, torch.linalg.cross(data.spin_before, arm))
     return FreeMotion(
-        data.spin, velocity, data.spin - data.spin_before - dt * spin_free, velocity - before - dt * gravity
+        data.spin - data.spin_before - dt * spin_free, data.velocity - data.velocity_before - dt * gravity
     )
-
-
-def _turn(rotation: Float[Tensor, "n 3 3"], vectors: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-    return torch.bmm(rotation, vectors[..., None])[..., 0]
 
 
 def find_contacts(
     rotation: Float[Tensor, "n 3 3"], position_m: Float[Tensor, "n 3"], body: Body, contacts: int
 ) -> Contacts:
     """The lowest points at each pose; heights are above the plane."""
-    arms = body.points_m - body.center_m
     up = rotation[:, 2]
-    center_z = position_m[:, 2] + up @ body.center_m - body.plane_m
     with torch.no_grad():
-        heights = up @ arms.T
+        heights = up @ body.points_m.T
         count = min(contacts, heights.shape[1])
         index = torch.topk(heights, count, dim=1, largest=False).indices
-    arm = arms[index]
-    height = (arm * up[:, None]).sum(-1) + center_z[:, None]
+    arm = body.points_m[index]
+    height = (arm * up[:, None]).sum(-1) + position_m[:, 2:]
     return Contacts(index, arm, height)
 
 
@@ -193,7 +177,6 @@ def prediction(
     free: FreeMotion,
     arm: Float[Tensor, "n k 3"],
     lam: Float[Tensor, "n k 3"],
-    epsilon: float,
 ) -> Float[Tensor, " n"]:
     """1/2 dv' M dv - lam' J dv + 1/2 lam' (D + eps) lam >= 0, in J: the momentum that the impulses do not explain."""
     one = torch.ones_like(body.friction)
@@ -205,7 +188,7 @@ def prediction(
     impulses = push.square().sum(-1) / REFERENCE_MASS_KG + ((torque @ inverse) * torque).sum(-1)
     momentum = REFERENCE_MASS_KG * free.velocity_change.square().sum(-1)
     momentum = momentum + ((free.spin_change @ body.inertia_kgm2) * free.spin_change).sum(-1)
-    return 0.5 * (momentum + impulses + epsilon * lam.square().sum((1, 2))) - work
+    return 0.5 * (momentum + impulses + EPSILON * lam.square().sum((1, 2))) - work
 
 
 def complementarity(height_m: Float[Tensor, "n k"], lam: Float[Tensor, "n k 3"]) -> Float[Tensor, " n"]:
@@ -231,7 +214,7 @@ def linear_cost(
     data: StepData, body: Body, free: FreeMotion, found: Contacts, weights: Weights
 ) -> Float[Tensor, "n k 3"]:
     """q of the inner problem, divided by w_pred: -J dv + w_comp (0, 0, |phi|) + w_diss dt (mu v_t, mu |v_t|)."""
-    slip = point_velocity(data.rotation, found.arm_m, free.spin, free.velocity)[..., :2]
+    slip = point_velocity(data.rotation, found.arm_m, data.spin, data.velocity)[..., :2]
     change = point_velocity(data.rotation, found.arm_m, free.spin_change, free.velocity_change)
     drag = (weights.dissipation / weights.prediction) * data.step_s[:, None, None] * body.friction
     speed = (slip.square().sum(-1, keepdim=True) + TINY).sqrt()
@@ -251,7 +234,7 @@ class Impulses:
 
 
 @torch.no_grad()
-def solve_impulses(data: StepData, body: Body, contacts: int, weights: Weights, epsilon: float = EPSILON) -> Impulses:
+def solve_impulses(data: StepData, body: Body, contacts: int, weights: Weights) -> Impulses:
     """The impulses of every transition; lam = 0 exactly where q is in K. Updates the data's warm starts."""
     free = free_motion(data, body)
     found = find_contacts(data.rotation, data.position_m, body, contacts)
@@ -259,7 +242,7 @@ def solve_impulses(data: StepData, body: Body, contacts: int, weights: Weights, 
     rows = (~in_cone(q)).nonzero()[:, 0]
     part = data.rows(rows)
     A = jacobian(part.rotation, body.friction, body.inertia_kgm2, found.arm_m[rows])
-    solved = solve_cones(A, q[rows], epsilon, part.warm)
+    solved = solve_cones(A, q[rows], EPSILON, part.warm)
     data.warm[rows] = torch.where(solved.failed[:, None], 0.0, solved.primal)
     return Impulses(rows, solved.impulse, solved.failed, solved.iterations)
 
@@ -283,7 +266,7 @@ class StepTerms:
         )
 
 
-def step_terms(data: StepData, body: Body, impulses: Impulses, contacts: int, epsilon: float = EPSILON) -> StepTerms:
+def step_terms(data: StepData, body: Body, impulses: Impulses, contacts: int) -> StepTerms:
     """The terms of the rows at their impulses (constants). A failed row's impulse lies in the cones too, so its terms
     are an upper bound and it stays in (and is counted); only numbers that overflowed are left out."""
     finite = torch.isfinite(impulses.impulse).all(-1).all(-1)
@@ -291,10 +274,10 @@ def step_terms(data: StepData, body: Body, impulses: Impulses, contacts: int, ep
     part = data.rows(rows)
     free = free_motion(part, body)
     found = find_contacts(part.rotation, part.position_m, body, contacts)
-    slip = point_velocity(part.rotation, found.arm_m, free.spin, free.velocity)[..., :2]
+    slip = point_velocity(part.rotation, found.arm_m, part.spin, part.velocity)[..., :2]
     return StepTerms(
         rows,
-        prediction(part, body, free, found.arm_m, lam, epsilon),
+        prediction(part, body, free, found.arm_m, lam),
         complementarity(found.height_m, lam),
         dissipation(body, slip, part.step_s, lam),
         penetration(found.height_m),
@@ -325,16 +308,14 @@ class LossValue:
     impulses: Impulses
 
 
-def contact_loss(
-    data: StepData, body: Body, contacts: int, weights: Weights, epsilon: float = EPSILON, idle_gradient: bool = True
-) -> LossValue:
-    """The loss over all transitions. `idle_gradient` False saves the gradient of rows where nothing touches: exact
-    where inertia and centre of mass are not learned and no screened row penetrates."""
+def contact_loss(data: StepData, body: Body, contacts: int, weights: Weights) -> LossValue:
+    """The loss over all transitions. Rows where nothing touches take no part in the gradient: exact where none of them
+    penetrates."""
     fixed = Body(*(getattr(body, f.name).detach() for f in fields(Body)))
-    impulses = solve_impulses(data, fixed, contacts, weights, epsilon)
-    solved = step_terms(data, body, impulses, contacts, epsilon)
-    with torch.set_grad_enabled(idle_gradient and torch.is_grad_enabled()):
-        idle = idle_terms(data, body if idle_gradient else fixed, impulses, contacts)
+    impulses = solve_impulses(data, fixed, contacts, weights)
+    solved = step_terms(data, body, impulses, contacts)
+    with torch.no_grad():
+        idle = idle_terms(data, fixed, impulses, contacts)
     total_weight = data.weight.sum().clamp_min(TINY)
     loss = data.weight.new_zeros(())
     means = {f.name: 0.0 for f in fields(ContactTerms)}

@@ -48,23 +48,18 @@ class Rollout:
 
 @dataclass(frozen=True, eq=False)
 class _Bodies:
-    """One body per row, of the same inertia, about their centres of mass."""
+    """One body per row, of the same inertia."""
 
     points_m: Float[Tensor, "n v 3"]
     friction: Float[Tensor, " n"]
     inertia_kgm2: Float[Tensor, "3 3"]
-    center_m: Float[Tensor, "n 3"]
-    lift_m: Float[Tensor, "n 3"]
 
     @staticmethod
     def stack(bodies: Sequence[Body], owner: Sequence[int]) -> _Bodies:
         def rows(values: list[Tensor]) -> Tensor:
             return torch.stack(values)[torch.as_tensor(owner, device=values[0].device)]
 
-        centered = rows([b.points_m - b.center_m for b in bodies])
-        lift = rows([b.plane_m for b in bodies])[:, None] * centered.new_tensor([0.0, 0.0, 1.0])
-        center = rows([b.center_m for b in bodies])
-        return _Bodies(centered, rows([b.friction for b in bodies]), bodies[0].inertia_kgm2, center, lift)
+        return _Bodies(rows([b.points_m for b in bodies]), rows([b.friction for b in bodies]), bodies[0].inertia_kgm2)
 
     def lowest(
         self, rotation: Float[Tensor, "n 3 3"], position_m: Float[Tensor, "n 3"], contacts: int
@@ -91,8 +86,7 @@ def simulate(
         return torch.as_tensor(values, dtype=torch.float64, device=body.points_m.device)
 
     rotation, spin = tensor(start.rotation), tensor(start.spin_object_rad_s)
-    position = tensor(start.position_m) + _turn(rotation, body.center_m) - body.lift_m
-    velocity = tensor(start.velocity_world_m_s) + _turn(rotation, torch.linalg.cross(spin, body.center_m))
+    position, velocity = tensor(start.position_m), tensor(start.velocity_world_m_s)
     warm = position.new_zeros((len(position), 6))
     rotations, positions, failures = [], [], 0
     for _ in range(steps):
@@ -101,7 +95,7 @@ def simulate(
         rotation = rotation @ _exp(step_s * spin)
         position = position + step_s * velocity
         rotations.append(rotation)
-        positions.append(position - _turn(rotation, body.center_m) + body.lift_m)
+        positions.append(position)
     return Rollout(torch.stack(rotations, 1).cpu().numpy(), torch.stack(positions, 1).cpu().numpy(), failures)
 
 
@@ -110,11 +104,9 @@ def simulate_law(body: Body, contacts: int, law: Law, start: Start, steps: int, 
     (fine_steps)."""
     from processing.contact.physics.steps_cpu import roll_rows
 
-    center, lift = body.center_m.cpu().numpy(), float(body.plane_m) * np.array([0.0, 0.0, 1.0])
-    points = body.points_m.cpu().numpy() - center
+    points = body.points_m.cpu().numpy()
     rotation, spin = np.array(start.rotation), np.array(start.spin_object_rad_s)
-    position = start.position_m + rotation @ center - lift
-    velocity = start.velocity_world_m_s + np.einsum("nij,nj->ni", rotation, np.cross(spin, center))
+    position, velocity = np.array(start.position_m), np.array(start.velocity_world_m_s)
     laws, owner = np.array([[law.friction, law.restitution]]), np.zeros(len(position), dtype=np.int64)
     inertia, count = body.inertia_kgm2.cpu().numpy(), fine_steps(step_s)
     most = min(contacts, len(points))
@@ -124,7 +116,7 @@ def simulate_law(body: Body, contacts: int, law: Law, start: Start, steps: int, 
         _, failed = roll_rows(*state, owner, laws, points, inertia, REFERENCE_MASS_KG, most, count, step_s / count)
         failures += failed
         rotations.append(rotation.copy())
-        positions.append(position - rotation @ center + lift)
+        positions.append(position.copy())
     return Rollout(np.stack(rotations, 1), np.stack(positions, 1), failures)
 
 
@@ -162,10 +154,6 @@ def _after_contact(
     velocity = velocity.index_add(0, rows, momentum[:, 3:] / REFERENCE_MASS_KG**0.5)
     warm = torch.zeros_like(warm).index_copy(0, rows, solved.primal)
     return spin, velocity, warm, int(solved.failed.sum())
-
-
-def _turn(rotation: Float[Tensor, "n 3 3"], vectors: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-    return torch.bmm(rotation, vectors[..., None])[..., 0]
 
 
 def _exp(vectors: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3 3"]:

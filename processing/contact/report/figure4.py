@@ -9,8 +9,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
 from processing.contact.learn.from_tracks import TrackLearning, TracksConfig, learn_from_tracks
 from processing.contact.learn.learn import ContactLearning
 from processing.contact.learn.shape_comparison import series_of, usable
@@ -21,6 +19,7 @@ from recordings.errors import BadInput
 from recordings.geometry import Transform
 from recordings.progress import Progress
 from recordings.tracks import ObjectShape, ObjectTrack
+from recordings.whole_file import without_nan
 
 STEP_S = 1 / 148
 
@@ -39,7 +38,7 @@ class Figure4:
 
     def to_json(self) -> dict[str, Any]:
         """The document; steps that no toss reaches are None."""
-        document = {
+        return {
             "steps": FIGURE_4_STEPS,
             "dt_s": self.estimated.errors.step_s,
             "learned_from": list(self.learning.tosses),
@@ -47,7 +46,6 @@ class Figure4:
             "friction": self.learning.friction.to_json(),
             "against_track": _part(self.estimated, self.not_learned),
         }
-        return document
 
 
 def learn_figure_4(
@@ -58,7 +56,6 @@ def learn_figure_4(
     physics: Physics | None = None,
     config: TracksConfig | None = None,
     progress: Progress | None = None,
-    step_s: float = STEP_S,
 ) -> tuple[Figure4, TrackLearning]:
     """Learn on the estimated tracks of all tosses but the last, and roll all of them out.
 
@@ -71,7 +68,7 @@ def learn_figure_4(
         raise BadInput(f"Figure 4 learns on all tosses but the last; {len(there)} can be used, wanted at least 2")
     learned = {t: tracks[t] for t in there[:-1]}
     found = learn_from_tracks(learned, shape, world_from_camera, plane, physics, config, progress)
-    return figure_4(found.fused, {t: tracks[t] for t in there}, world_from_camera, plane, step_s), found
+    return figure_4(found.fused, {t: tracks[t] for t in there}, world_from_camera, plane), found
 
 
 def figure_4(
@@ -79,11 +76,10 @@ def figure_4(
     tracks: Mapping[int, ObjectTrack],
     world_from_camera: Transform,
     plane: Plane | None = None,
-    step_s: float = STEP_S,
 ) -> Figure4:
     """Roll out all tosses with what was learned on some of them; the tracks are resampled to the step."""
     plane = plane or Plane()
-    done = evaluate(learning, series_of(tracks, world_from_camera), plane, FIGURE_4_STEPS, step_s, "release")
+    done = evaluate(learning, series_of(tracks, world_from_camera), plane, FIGURE_4_STEPS, STEP_S, "release")
     return Figure4(learning, done, tuple(t for t in done.errors.tosses if t not in learning.tosses), plane)
 
 
@@ -95,13 +91,5 @@ def _part(done: Evaluation, not_learned: Sequence[int]) -> dict[str, Any]:
         for t in not_learned
         if t in per_toss
     }
-    finite: dict[str, Any] = _none_for_nan(document)
+    finite: dict[str, Any] = without_nan(document)
     return finite
-
-
-def _none_for_nan(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {k: _none_for_nan(v) for k, v in value.items()}
-    if isinstance(value, list):
-        return [_none_for_nan(v) for v in value]
-    return None if isinstance(value, float) and not np.isfinite(value) else value

@@ -61,10 +61,6 @@ def result_document(learning: ContactLearning, evaluation: Evaluation | None) ->
         document["vertices_m"] = learning.model.support_vertices_m.tolist()
         if learning.spread.points_m is not None:
             document["vertices_half_width_m"] = learning.spread.points_m.tolist()
-    if learning.fitted.config.learn_center:
-        document["center_half_width_m"] = learning.spread.center_m.tolist()
-    if learning.fitted.config.learn_inertia:
-        document["inertia_parameters_half_width"] = learning.spread.inertia_relative.tolist()
     if evaluation is not None:
         document["rollout"] = evaluation.to_json()
     return document

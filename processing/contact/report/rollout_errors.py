@@ -100,11 +100,6 @@ class Evaluation:
         }
 
 
-def prepared_for(learning: ContactLearning, tracks: Sequence[PoseSeries], plane: Plane) -> Prepared:
-    """Tracks in the frame that was learned in."""
-    return prepare(tracks, learning.frame, plane, learning.fitted.inertia_start_kgm2)
-
-
 def evaluate(
     learning: ContactLearning,
     tracks: Sequence[PoseSeries],
@@ -120,10 +115,11 @@ def evaluate(
     `thrown`: from the first frame, unless a hand holds the object for HELD_S or longer: then from the release.
     `ready`: the tracks as they were prepared before.
     """
-    prepared = prepared_for(learning, tracks, plane or Plane()) if ready is None else ready
+    inertia = learning.fitted.inertia_kgm2
+    prepared = prepare(tracks, learning.frame, plane or Plane(), inertia) if ready is None else ready
     first = None if begin == "release" else [0 if begin == "first" else _thrown(s) for s in prepared.smoothed]
     fine_s = step_s if learning.law is None else step_s / fine_steps(step_s)
-    start, frames = starts(prepared, fine_s, learning.fitted.inertia_start_kgm2, first)
+    start, frames = starts(prepared, fine_s, inertia, first)
     body, contacts = learning.body(), learning.fitted.geometry.contacts
     if learning.law is None:
         rolled = simulate(body, contacts, start, steps, step_s)

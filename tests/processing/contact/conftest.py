@@ -35,7 +35,7 @@ def the_body() -> Body:
 
     points = number(CORNERS * HALF_M)
     inertia = number(physics_of_the_box().inertia_kgm2)
-    return Body(points, number(0.25), inertia, number(np.zeros(3)), number(0.0))
+    return Body(points, number(0.25), inertia)
 
 
 @pytest.fixture

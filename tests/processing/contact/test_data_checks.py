@@ -97,7 +97,7 @@ def test_inverse_rotations_are_told_from_impacts_alone(real_tosses):
 def test_the_real_tosses_mean_what_they_say(real_tosses):
     tracks = real_tosses(range(8))
     checks.check_velocities(tracks)
-    assert checks.check_fall(tracks) == pytest.approx(-9.67, abs=0.15)  # facts/contact.md: -9.67 +- noise
+    assert checks.check_fall(tracks) == pytest.approx(-9.67, abs=0.15)  # as measured before: -9.67 +- noise
     assert checks.check_orientations(tracks, np.eye(3)) < 0.2
 
 

@@ -145,12 +145,9 @@ def test_agrees_with_the_slow_evaluation_on_real_tosses(real_tosses):
     assert fast == pytest.approx(slow_loss(data, body, Weights()), rel=1e-6)
 
 
-@pytest.mark.parametrize("learn", [{}, {"learn_inertia": True, "learn_center": True}])
-def test_the_envelope_gradient_is_the_derivative(simulated_tosses, box_physics, learn):
+def test_the_envelope_gradient_is_the_derivative(simulated_tosses, box_physics):
     data = StepData(steps_of([differences(t) for t in simulated_tosses(2)]))
-    model = Model(
-        Box(np.array([0.052, 0.039, 0.031])), box_physics.inertia_kgm2, FitConfig(friction_start=0.2, **learn)
-    )
+    model = Model(Box(np.array([0.052, 0.039, 0.031])), box_physics.inertia_kgm2, FitConfig(friction_start=0.2))
     start = torch.as_tensor(model.start())
     parameters = start.clone().requires_grad_(True)
     model.loss(parameters, data, Weights(dissipation=3.0)).loss.backward()

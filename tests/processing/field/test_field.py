@@ -144,10 +144,9 @@ def spread_deg(estimated, true) -> float:
     return float(np.degrees(np.median((turns.mean().inv() * turns).magnitude())))
 
 
-@pytest.mark.parametrize("encoding", ["dense", "hash"])
-def test_both_encodings_reach_the_same_surface(views, encoding):
+def test_the_field_reaches_the_surface(views):
     torch.set_num_threads(1)
-    trained = train_field(views, FieldConfig(encoding=encoding, steps=40, pose_rounds=0, rays=1024))
+    trained = train_field(views, FieldConfig(steps=40, pose_rounds=0, rays=1024))
     shape = extract_mesh(trained.field, trained.grid)
     assert np.median(np.abs(distance_to_cube_m(shape.vertices_m))) < 0.0003
     assert trained.losses[-1] < 2 * trained.losses[0]

@@ -9,14 +9,15 @@ import pytest
 from recordings.errors import BadInput
 from recordings.records import DepthImage, StampedPose
 from recordings.session_writer import SessionWriter
+from recordings.view import layers
 from recordings.view.draw import Choice, is_foreign, open_scene, save_rrd
-from recordings.view.layers import Look
 from recordings.view.scene import half_way_down_ns, lay_out, moment_ns
 from recordings.view.viewer import run_rerun
 
 
-def test_a_large_image_is_thinned_to_the_number_of_points_asked_for(tiny, session, tmp_path):
-    save_rrd(session, tmp_path / "thin.rrd", look=Look(cloud_points=200))
+def test_a_large_image_is_thinned_to_the_number_of_points_asked_for(tiny, session, tmp_path, monkeypatch):
+    monkeypatch.setattr(layers, "CLOUD_POINTS", 200)
+    save_rrd(session, tmp_path / "thin.rrd")
     _, _, points = tiny.Rrd(tmp_path / "thin.rrd").rows("/world/seen_by/d455", "Points3D:positions")[0]
     assert 100 < len(points) <= 200
 
@@ -94,7 +95,7 @@ def test_contactnets_poses_are_shown_with_their_tosses_apart(tiny, data, tmp_pat
     assert len(set(tosses)) == 3
     assert tosses == sorted(tosses)
     _, _, half = rrd.rows("/world/object/track/box", "Boxes3D:half_sizes")[0]
-    assert half[0][0] == pytest.approx(0.0512, abs=0.002)  # the cube of 104.8 mm rests 51.2 mm high (data/README.md)
+    assert half[0][0] == pytest.approx(0.0512, abs=0.002)  # the cube of 104.8 mm rests 51.2 mm high
 
 
 def test_one_toss_s_file_alone_is_shown(tiny, session, tmp_path):
