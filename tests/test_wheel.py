@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -41,6 +42,16 @@ def elsewhere(wheel, tmp_path_factory):
     return run
 
 
+def git(*words):
+    """What git says of the checkout."""
+    if shutil.which("git") is None:
+        pytest.skip("no git here to say what belongs to the checkout: apt-get install git")
+    done = subprocess.run(["git", *words], cwd=ROOT, capture_output=True, text=True)
+    if done.returncode:
+        pytest.skip("no git checkout: what belongs to it is not known")
+    return done.stdout
+
+
 def test_the_wheel_holds_the_packages_and_neither_tests_nor_tools(wheel):
     names = zipfile.ZipFile(wheel).namelist()
     folders = {name.split("/")[0] for name in names if ".dist-info/" not in name}
@@ -50,10 +61,8 @@ def test_the_wheel_holds_the_packages_and_neither_tests_nor_tools(wheel):
 
 def test_the_wheel_brings_what_is_no_python(wheel):
     names = set(zipfile.ZipFile(wheel).namelist())
-    tracked = subprocess.run(["git", "ls-files", "-z", *PACKAGES], cwd=ROOT, capture_output=True, text=True)
-    if tracked.returncode:
-        pytest.skip("no git checkout: what belongs to the packages is not known")
-    assert {n for n in tracked.stdout.split("\0") if n and (ROOT / n).exists()} <= names
+    tracked = git("ls-files", "-z", *PACKAGES)
+    assert {n for n in tracked.split("\0") if n and (ROOT / n).exists()} <= names
 
 
 def test_heavy_simulators_are_asked_for_by_the_extra_sim_alone():
@@ -80,10 +89,7 @@ print(recordings.__file__)"""
 
 def test_the_wheel_knows_its_commit(elsewhere):
     said = json.loads(elsewhere("import json; from recordings.version import versions; print(json.dumps(versions()))"))
-    head = subprocess.run(["git", "rev-parse", "HEAD"], cwd=ROOT, capture_output=True, text=True)
-    if head.returncode:
-        pytest.skip("no git checkout: no commit to know")
-    assert head.stdout.startswith(said["commit"].removesuffix("+changes"))
+    assert git("rev-parse", "HEAD").startswith(said["commit"].removesuffix("+changes"))
 
 
 def test_the_shipped_sample_is_found_and_whole_in_the_wheel(elsewhere):

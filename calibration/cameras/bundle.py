@@ -110,6 +110,8 @@ class Solved:
     weight: Float[Array, " n"]
     covariance: Float[Array, "u u"]
     blocks: Mapping[tuple[str, int], slice]
+    scores: Float[Array, "u v"]
+    """How the points of each view pull at the free numbers: minus half the gradient of their cost."""
     scale: float
     """Left over / expected: above 1, the pixels scatter more than their covariances say."""
     weakest: float
@@ -178,10 +180,21 @@ def _finished(
         weight,
         inverse * max(scale, 1.0) ** 2,
         blocks,
+        _scores(jacobian, residual, weight, seen),
         scale,
         float(values[0]),
         named,
     )
+
+
+def _scores(
+    jacobian: sparse.csr_matrix, residual: Float[Array, "n 2"], weight: Float[Array, " n"], seen: Observations
+) -> Float[Array, "u v"]:
+    views, view = np.unique(seen.view, return_inverse=True)
+    rows = np.arange(2 * len(seen))
+    values = -(weight[:, None] * residual).ravel()
+    by_view = sparse.csr_matrix((values, (rows, np.repeat(view, 2))), shape=(len(rows), len(views)))
+    return (jacobian.T @ by_view).toarray()
 
 
 def _unwhitened(residual: Float[Array, "n 2"], seen: Observations) -> Float[Array, "n 2"]:

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 from numpy import ndarray as Array
 
 from calibration.cameras.bundle import Observations, Scene, Solved, adjust
-from calibration.cameras.lens_forms import still_numbers
+from calibration.cameras.lens_prior import still_numbers
 from calibration.cameras.pnp import connected, poses_of_points
 from calibration.cameras.poses import angle_deg, inverse_poses
 from calibration.cameras.targets import TargetView, numbered_marks

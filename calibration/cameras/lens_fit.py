@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -11,12 +11,15 @@ from numpy import ndarray as Array
 
 from calibration.cameras.bundle import Observations, Scene, Solved, adjust
 from calibration.cameras.extrinsics import bad_views, board_pose, whitening
+from calibration.cameras.lens_prior import has_k3, with_weighed_k3
 from calibration.cameras.targets import TargetView, numbered_marks
 from recordings.errors import BadInput
 from recordings.geometry import CameraModel
 
 LEAST_VIEWS = 5
 FOLDS = 4
+HUBER = 3.0
+"""In standard deviations of what is left over, where that is more than the corners' own: see `solve_lens`."""
 STANDARD_ERRORS = 1.0
 """Another lens than the standard one is taken where it leaves so many standard errors less of views kept aside (the
 one-standard-error rule: Breiman et al., Classification and Regression Trees, 1984, section 3.4.3)."""
@@ -39,25 +42,35 @@ class Fit:
         return self.solved.scene.models[0]
 
     @staticmethod
-    def of(start: CameraModel, views: Sequence[TargetView], still: int = 0) -> Fit:
+    def of(start: CameraModel, views: Sequence[TargetView]) -> Fit:
         """All views, then without those that do not fit; and each quarter of them kept aside once."""
-        solved, seen = solve_lens(start, views, range(len(views)), still=still)
+        solved, seen = fit_lens(start, views, range(len(views)))
         rejected = tuple(v for _, v in bad_views(solved, seen))
         numbers = [v for v in range(len(views)) if v not in rejected]
         if rejected and len(numbers) >= LEAST_VIEWS:
-            solved, seen = solve_lens(start, views, numbers, still=still)
+            solved, seen = fit_lens(start, views, numbers)
         else:
             rejected, numbers = (), list(range(len(views)))
         squares: dict[int, Float[Array, "n 2"]] = {}
         for fold in range(FOLDS):
             aside = numbers[fold::FOLDS]
-            kept = [v for v in numbers if v not in aside]
-            rest, _ = solve_lens(solved.scene.models[0], views, kept, still=still)
+            rest, _ = fit_lens(solved.scene.models[0], views, [v for v in numbers if v not in aside])
             squares |= squares_aside(rest.scene.models[0], views, aside)
         hold_out = float(np.sqrt(np.concatenate([*squares.values()]).mean()))
         if rejected:
             squares |= squares_aside(solved.scene.models[0], views, rejected)
         return Fit(solved, seen, rejected, {v: float(q.mean()) for v, q in squares.items()}, hold_out)
+
+
+def fit_lens(
+    start: CameraModel, views: Sequence[TargetView], numbers: Sequence[int], print_m: float | None = None
+) -> tuple[Solved, Observations]:
+    """As `solve_lens`, but Brown's k3 is first fitted freely, then held at as much of it as the views tell."""
+    solved, seen = solve_lens(start, views, numbers, print_m=print_m)
+    if not has_k3(start):
+        return solved, seen
+    held = with_weighed_k3(start, solved.scene.models[0], float(solved.std("lens", 0)[-1]))
+    return solve_lens(held, views, numbers, print_m=print_m, still=1)
 
 
 def squares_aside(
@@ -89,7 +102,11 @@ def solve_lens(
     still: int = 0,
 ) -> tuple[Solved, Observations]:
     """Lens (where free, without its last `still` numbers) and board poses from the views of these numbers; with
-    `print_m`, the standard deviation of where the board's marks lie, also their places."""
+    `print_m`, the standard deviation of where the board's marks lie, also their places.
+
+    A board's corners scatter more than their detector says (blur, light, a board not quite flat), and then most of a
+    view is no outlier: where a lens is solved, Huber's weight begins at so many deviations of what is left over.
+    """
     poses, chosen = np.tile(np.eye(4), (len(views), 1, 1)), []
     for v in numbers:
         found = board_pose(start, views[v])
@@ -115,4 +132,20 @@ def solve_lens(
     scene = Scene(
         (start,), one, poses, one, no, free_views, no, lens, np.ones(1), no, shift, print_m, still_numbers=(still,)
     )
-    return adjust(scene, seen), seen
+    solved = adjust(scene, seen, HUBER)
+    if not free_lens:
+        return solved, seen
+    if solved.scale > 1:
+        solved = adjust(solved.scene, seen, HUBER * solved.scale)
+    return replace(solved, covariance=solved.covariance * max(1.0, _alike(solved))), seen
+
+
+def _alike(solved: Solved) -> float:
+    """By how much the lens's variance is larger than that of points which err each by itself: those of one view err
+    alike. How far each view pulls the lens is what it would move by without that view (the jackknife); the mean over
+    all directions of their spread against the formal covariance (the design effect of Rao and Scott, JASA 1981)."""
+    lens = solved.blocks["lens", 0]
+    pulls = solved.covariance[lens] @ solved.scores / max(solved.scale, 1.0) ** 2
+    views, formal = pulls.shape[1], solved.covariance[lens, lens]
+    spread = pulls @ pulls.T * views / max(views - 1, 1)
+    return float(np.trace(np.linalg.pinv(formal, hermitian=True) @ spread)) / len(formal)

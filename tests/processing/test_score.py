@@ -15,12 +15,17 @@ import numpy as np
 import pytest
 import trimesh
 
+from processing.config import Config
+from processing.evaluate.floor import coverage_floor
 from processing.evaluate.score import VariantScore, score_variant
 from processing.evaluate.table import collect, markdown, table_document
 from processing.evaluate.truth import Truth
+from processing.start import start_run
 from recordings.exporters.export import export
 from recordings.geometry import CameraModel, rotation_exp
+from recordings.progress import Silent
 from recordings.results.folder import Results, Scope, TossRecord, VariantRecord, write_shape, write_track, write_variant
+from recordings.session import Session
 from recordings.tracks import ObjectShape, ObjectTrack, RigCalibration, Status
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -239,3 +244,18 @@ def test_our_chamfer_distances_are_the_independent_scorers(tmp_path: Path, indep
     ours, theirs = folders.score().values, independent(folders, "--shape", str(tmp_path / "shape.obj"))["total"]
     assert ours["cd"].value == pytest.approx(theirs["cd_cm"], abs=1e-6)
     assert ours["cd_icp"].value == pytest.approx(theirs["cd_icp_cm"], abs=1e-3)
+
+
+def test_a_floor_that_could_not_be_computed_is_said_of_its_toss(sample_session: Session, tmp_path: Path) -> None:
+    mesh = tmp_path / "mesh.obj"
+    trimesh.creation.box((0.1, 0.1, 0.1)).export(mesh)
+    truth = Truth(tmp_path, sample_session.calibration, mesh)  # it knows the shape and no pose
+    record = VariantRecord(
+        "ours", "one", "ours", "sample", "box", sample_session.calibration, (TossRecord(0, "track", "shape", "masks"),)
+    )
+    run = start_run(sample_session, [0], tmp_path / "results", Config(), "multi-hypothesis", lambda label: Silent())
+    values, warnings = coverage_floor(run, {0: sample_session.toss(0).rgbd("d455")}, record, truth)
+    assert values == {}
+    assert warnings == (
+        "toss 0: what its frames show of the shape (floor) is not known: the truth has no pose of its frames",
+    )
