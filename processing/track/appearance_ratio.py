@@ -22,7 +22,8 @@ from processing.motion import se3_kernels as se3
 from processing.sensor import noise
 from processing.sensor import view_layout as lay
 from processing.sensor.view import ViewStore
-from processing.track.beam import USUAL_DISTANCE_M, Scene
+from processing.track.beam import Scene
+from processing.track.schedule import USUAL_DISTANCE_M
 from recordings.constants import MAD_TO_SIGMA_SHORT
 
 FIRST_APPEARANCE = lay.SMOOTH + 1

@@ -22,12 +22,8 @@ from processing.motion.rotation_grid import turn_grid
 from processing.sensor.view import ViewStore
 from processing.track import kernels as k
 from processing.track.keyframes import KeyframeConfig, is_new, references
+from processing.track.schedule import Schedule, rows
 
-Schedule = tuple[tuple[int, int, float, float, float, float], ...]
-"""Rows of kernels.align_view: level (0 sharp, 1 smooth), steps, depth scale (m at 0.8 m), scale of the appearance,
-outline scale (m at 0.8 m), share of the samples."""
-
-USUAL_DISTANCE_M = 0.8
 LEAST_DELAY_S = 0.0003
 """Between colour and depth: less is no motion."""
 
@@ -138,15 +134,6 @@ class Followed:
     best: Hypothesis
     margin: float
     rejected: dict[int, list[Candidate]]
-
-
-def rows(schedule: Schedule, distance_m: float, round_body: bool = False) -> Float[Array, "r 7"]:
-    """The schedule's scales for an object at this distance: stereo depth errors grow with its square."""
-    out = np.concatenate([np.array(schedule, dtype=np.float64), np.full((len(schedule), 1), float(round_body))], 1)
-    ratio = distance_m / USUAL_DISTANCE_M
-    out[:, k.GEOMETRY_M] *= np.clip(ratio**2, 0.5, 4.0)
-    out[:, k.OUTLINE_M] *= np.clip(ratio, 0.5, 2.0)
-    return out
 
 
 def follow(
@@ -404,4 +391,6 @@ def _motion_cost(scene: Scene, h: Hypothesis, i: int, pose: Float[Array, "4 4"],
     steps = (times[b] - times[a], times[i] - times[b])
     recent = list(tracked[-6:])
     spin = steady_spin(h.poses[recent], times[recent])
-    return change_cost(three, steps, scene.center_m, scene.gravity_camera_m_s2, config.motion, spin, scene.free((a, b, i)))
+    return change_cost(
+        three, steps, scene.center_m, scene.gravity_camera_m_s2, config.motion, spin, scene.free([a, b, i])
+    )

@@ -13,14 +13,13 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray as Array
 
-from processing.motion import se3_kernels as se3
 from processing.motion.rotation_grid import ball
 from processing.sensor import view_layout as lay
-from processing.track.beam import BeamConfig, Hypothesis, Scene, Schedule, follow, rows
+from processing.track.beam import BeamConfig, Hypothesis, Scene, follow
 from processing.track.flight_kernels import SPIN, VELOCITY, fit_flights
 from processing.track.keyframes import is_new
+from processing.track.schedule import Schedule, rows
 from recordings.geometry import rotation_exp
-
 
 BEHIND = 0.7
 """How far a body's centre lies behind the mean of its visible surface, in radii: 2/3 of a ball, pi/4 of a cylinder."""
@@ -67,8 +66,8 @@ class Flight:
 
 
 def flying(scene: Scene, count: int, config: FlightConfig) -> Int[Array, " m"]:
-    """Of the first `count` views the longest run in which the centre of what is seen falls as a free body does; none where gravity is
-    not known or nothing falls for long enough."""
+    """Of the first `count` views the longest run in which the centre of what is seen falls as a free body does; none
+    where gravity is not known or nothing falls for long enough."""
     usable = np.array([i for i in range(count) if scene.store.usable(i)], dtype=np.int64)
     if len(usable) < config.least_frames or not scene.gravity_camera_m_s2.any():
         return usable[:0]
@@ -206,7 +205,8 @@ def flights_followed(
 
 
 def _turned_apart_deg(one: Float[Array, "m 4 4"], other: Float[Array, "m 4 4"]) -> float:
-    """How much two solutions of a flight differ about the turn between any two frames; infinite where one lacks a pose."""
+    """How much two solutions of a flight differ about the turn between any two frames; infinite where one lacks a
+    pose."""
     both = np.swapaxes(one[:, :3, :3], 1, 2) @ other[:, :3, :3]
     if not np.isfinite(both).all():
         return float("inf")
@@ -224,4 +224,6 @@ def _followed(scene: Scene, flight: Flight, first: int, beam: BeamConfig) -> Hyp
         keys = (*keys, i) if is_new(poses, i, keys, scene.center_m, beam.keyframes) else keys
     h = Hypothesis(poses, costs, on, frames[::-1], keys, 0.0)
     h = follow(scene, np.arange(frames[0] - 1, first - 1, -1), [h], beam).best
-    return follow(scene, np.arange(frames[-1] + 1, n), [replace(h, done=tuple(range(first, frames[-1] + 1)))], beam).best
+    return follow(
+        scene, np.arange(frames[-1] + 1, n), [replace(h, done=tuple(range(first, frames[-1] + 1)))], beam
+    ).best

@@ -53,8 +53,8 @@ class HypothesisConfig:
     """A body whose views fit so many times worse on one profile is not round: a blurred box (2.9) may look so, mugs fit
     0.9 to 1.6 times as badly."""
     round_nats: float = 5.0
-    """Nor is one whose appearance speaks so much for the azimuths of free views (log likelihood ratio); what each of the
-    two leaves counts together."""
+    """Nor is one whose appearance speaks so much for the azimuths of free views (log likelihood ratio); both count
+    together."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -237,8 +237,7 @@ def refined(
     if _delayed(scene):
         use = use & put_at_color_times(scene, poses[:n], use)
     center_m = center_of_mass(poses[:n], use, scene)
-    flying = np.array([scene.flying is not None and i < n and scene.flying[i] for i in range(all_views)], dtype=bool)
-    motion = Motion(times_s, whose, scene.gravity_camera_m_s2, center_m, still, _carried(scene, use), flying)
+    motion = Motion(times_s, whose, scene.gravity_camera_m_s2, center_m, still, _carried(scene, use))
     seen = np.concatenate([use, drawn])
     if axis is None:
         joint = refine(scene.store, poses, seen, fixed, motion, config.graph)
@@ -279,9 +278,13 @@ def mean_motion_cost(
     index, t = np.flatnonzero(use), scene.times_s
     costs = [
         change_cost(
-            (poses[a], poses[b], poses[c]), (t[b] - t[a], t[c] - t[b]), center_m, scene.gravity_camera_m_s2, config,
-            flying=scene.free((a, b, c)),
-        )  # fmt: skip
+            (poses[a], poses[b], poses[c]),
+            (t[b] - t[a], t[c] - t[b]),
+            center_m,
+            scene.gravity_camera_m_s2,
+            config,
+            flying=scene.free([int(a), int(b), int(c)]),
+        )
         for a, b, c in zip(index, index[1:], index[2:])
     ]
     return float(np.sum(costs) / max(len(index), 1))

@@ -21,8 +21,8 @@ from processing.motion.motion_prior import free_change_rad_s, free_jerk_rad_s
 from processing.sensor import noise
 from processing.sensor.view import ViewStore
 from processing.track import kernels as k
-from processing.track.beam import Schedule, rows
 from processing.track.keyframes import view_directions
+from processing.track.schedule import Schedule, rows
 from processing.track.shading import eliminated
 from recordings.geometry import rotation_log, skew
 from recordings.robust import geman_mcclure_weight
@@ -111,12 +111,6 @@ class Motion:
     """Whether the object stands still between each view and the one before it in its toss."""
     carried: Mapping[tuple[int, int], Float[Array, "4 4"]] = field(default_factory=dict)
     """How the robot's hand moves (camera axes) from one view to the next."""
-    flying: Bool[Array, " n"] | None = None
-    """Views in which nothing can hit the body; None: not known of any."""
-
-    def free(self, views: Sequence[int]) -> bool:
-        """Whether the body flies in all these views."""
-        return self.flying is not None and bool(self.flying[list(views)].all())
 
 
 @dataclass(frozen=True, eq=False)
@@ -274,7 +268,7 @@ def _add_motion(
         free = free_change_rad_s(float(np.linalg.norm(turn)), 0.5 * (motion.times_s[c] - motion.times_s[a]))
         sigma_rad_s = float(np.hypot(config.spin_change_rad_s, free))
         spin, speed = residual[:3] / sigma_rad_s, residual[3:] / config.velocity_change_m_s
-        w_spin = (1.0 if motion.free((a, b, c)) else _accepted(spin)) / sigma_rad_s**2
+        w_spin = _accepted(spin) / sigma_rad_s**2
         w_speed = _accepted(speed) / config.velocity_change_m_s**2
         w = np.array([w_spin] * 3 + [w_speed] * 3)
         for x, jx in zip((a, b, c), jacobians):

@@ -19,8 +19,9 @@ from processing.sensor import view_layout as lay
 from processing.sensor.rectification import Rectification
 from processing.sensor.view import Crop
 from processing.track import kernels as k
-from processing.track.beam import BeamConfig, Candidate, Scene, Schedule, merged, rows
+from processing.track.beam import BeamConfig, Candidate, Scene, merged
 from processing.track.keyframes import references
+from processing.track.schedule import Schedule, rows
 from recordings.errors import BadInput
 from recordings.tracks import ObjectShape
 

@@ -282,10 +282,7 @@ def _followed(
         )
         if all(apart_deg(best.poses[:n], s.poses[:n]) > config.separate_deg for s in hypotheses):
             hypotheses.append(best)
-        through = [
-            _anchored(h, best, first)
-            for h in flights_followed(scene, first, best, narrow, config.flight)
-        ]
+        through = [_anchored(h, best, first) for h in flights_followed(scene, first, best, narrow, config.flight)]
         hypotheses += [
             h for h in through
             if all(apart_deg(h.poses[:n], s.poses[:n]) > config.separate_deg for s in hypotheses)

@@ -19,12 +19,12 @@ from processing.motion.rotation_grid import all_turns
 from processing.sensor import view_layout as lay
 from processing.sensor.view import ViewStore
 from processing.track import kernels as k
-from processing.track.beam import Schedule, rows
 from processing.track.joint_refinement import add_pairs
 from processing.track.keyframes import view_directions
 from processing.track.registration import consistency_kernels as c
 from processing.track.registration.keyframe_database import KeyframeDatabase, Sides, far_apart
 from processing.track.registration.proposals import Fit, distinct, stepped
+from processing.track.schedule import Schedule, rows
 
 
 @dataclass(frozen=True)

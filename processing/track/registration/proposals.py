@@ -12,9 +12,9 @@ from numpy import ndarray as Array
 from processing.features.sift import FeatureMatcher, Features, RansacConfig, relative_motions
 from processing.motion import se3_kernels as se3
 from processing.track import kernels as k
-from processing.track.beam import Schedule, rows
 from processing.track.keyframes import view_directions
 from processing.track.registration.keyframe_database import Sides
+from processing.track.schedule import Schedule, rows
 
 
 @dataclass(frozen=True)

@@ -18,10 +18,10 @@ from numpy import ndarray as Array
 from processing.motion import se3_kernels as se3
 from processing.sensor import view_layout as lay
 from processing.sensor.view import ViewStore
-from processing.track.beam import USUAL_DISTANCE_M
 from processing.track.revolution import profile_kernels as rk
 from processing.track.revolution.axis import Axis
 from processing.track.revolution.unwrapping import across
+from processing.track.schedule import USUAL_DISTANCE_M
 from recordings.geometry import rotation_log
 
 FAR_PX = 100.0

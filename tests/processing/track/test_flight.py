@@ -1,0 +1,105 @@
+"""A flight solved as one: which frames it has, its derivatives, and a spin that no frame-to-frame prior foretells."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from processing.features.sift import Sift
+from processing.motion.motion_prior import MotionConfig, change_cost, gravity_in_camera
+from processing.motion.rotation_grid import ball
+from processing.track.beam import Scene
+from processing.track.flight import FlightConfig, flights_followed, flying, solved
+from processing.track.flight_kernels import UNKNOWNS, _place
+from processing.track.track_toss import TrackConfig, first_pose, started, views_of
+from recordings.geometry import Transform, rotation_exp, rotation_log
+from recordings.progress import Silent
+
+STEP_S = 1 / 30
+HELD, FLIES = 3, 8
+SPIN = np.array([9.0, -12.0, 10.0])
+"""18 rad/s: 34 degrees a frame."""
+
+
+def thrown(i: int) -> Transform:
+    """world_from_object: held still, then thrown up and across the table."""
+    t = max(i - HELD, 0) * STEP_S
+    place = np.array([-0.12, -0.05, 0.14]) + np.array([0.8, 0.2, 0.9]) * t - np.array([0, 0, 0.5 * 9.81]) * t * t
+    return Transform("world", "object", rotation_exp(SPIN * t) @ rotation_exp(np.array([0.7, 0.5, 0.3])), place)
+
+
+@pytest.fixture(scope="module")
+def scene(tiny_world: Any) -> Scene:
+    seen = [tiny_world.see(thrown(i), i) for i in range(HELD + FLIES)]
+    frames = [replace(f, time_ns=round(i * STEP_S * 1e9), depth_time_ns=round(i * STEP_S * 1e9))
+              for i, (f, _) in enumerate(seen)]  # fmt: skip
+    store, times_s, _ = views_of(
+        frames, [m for _, m in seen], tiny_world.camera, np.ones(len(frames)), TrackConfig(),
+        tiny_world.world_from_camera, Silent(),
+    )  # fmt: skip
+    return Scene(store, times_s, gravity_in_camera(tiny_world.world_from_camera.matrix), np.zeros(3), Sift())
+
+
+def test_no_place_in_a_ball_is_far_from_its_lattice() -> None:
+    points = ball(1.0, 0.2)
+    places = np.random.default_rng(0).uniform(-0.5, 0.5, (500, 3))
+    nearest = np.linalg.norm(places[:, None] - points, axis=2).min(1)
+    assert nearest.max() < 0.2 * 2 / np.sqrt(3) * np.sqrt(5) / 4 + 1e-9  # the lattice's covering radius
+    assert np.linalg.norm(points, axis=1).max() <= 1.0
+
+
+@pytest.mark.parametrize("t", [-0.07, 0.0, 0.1])
+def test_a_flights_pose_has_the_derivatives_that_are_stated(t: float) -> None:
+    x = np.array([0.1, -0.05, 0.8, 0.7, -0.3, 1.1, 8.0, -15.0, 6.0])
+    gravity = np.array([0.5, 9.5, 2.0])
+    pose, J = np.zeros((4, 4)), np.zeros((6, UNKNOWNS))
+    _place(x, t, gravity, pose, J)
+    for a in range(UNKNOWNS):
+        near, unused = np.zeros((4, 4)), np.zeros((6, UNKNOWNS))
+        _place(x + 1e-6 * np.eye(UNKNOWNS)[a], t, gravity, near, unused)
+        step = np.linalg.inv(near) @ pose  # object_from_camera <- exp(twist) object_from_camera
+        twist = np.concatenate([step[:3, 3], rotation_log(step[:3, :3])]) / 1e-6
+        np.testing.assert_allclose(J[:, a], twist, atol=1e-5)
+
+
+def test_the_frames_in_which_the_body_falls_are_found_and_held_ones_are_not(scene: Scene) -> None:
+    found = flying(scene, len(scene.times_s), FlightConfig())
+    assert set(range(HELD + 1, HELD + FLIES)) <= set(found.tolist())
+    assert found.min() >= HELD - 1
+
+
+def test_without_gravity_nothing_is_known_to_fly(scene: Scene) -> None:
+    nowhere = replace(scene, gravity_camera_m_s2=np.zeros(3))
+    assert len(flying(nowhere, len(scene.times_s), FlightConfig())) == 0
+
+
+def test_a_spin_of_34_degrees_a_frame_is_found_among_all(scene: Scene, tiny_world: Any) -> None:
+    best = solved(scene, np.arange(HELD + 1, HELD + 6), FlightConfig())[0]
+    true = tiny_world.world_from_camera.inverse().vectors(SPIN[None])[0]
+    np.testing.assert_allclose(best.spin_rad_s, true, atol=0.8)
+
+
+def test_the_beam_goes_on_from_a_solved_flight_both_ways(scene: Scene, tiny_world: Any) -> None:
+    n, camera = len(scene.times_s), tiny_world.world_from_camera.rotation
+    fly = replace(scene, flying=np.isin(np.arange(n), flying(scene, n, FlightConfig())))
+    nothing = started(scene.store, n, 0, first_pose(scene.store, 0))
+    best = flights_followed(fly, 0, nothing, TrackConfig().beam, FlightConfig())[0]
+    assert best.tracked == tuple(range(n))
+    for i in range(HELD + 1, n):
+        turn = best.poses[i, :3, :3] @ best.poses[HELD, :3, :3].T
+        true = camera.T @ thrown(i).rotation @ thrown(HELD).rotation.T @ camera
+        assert np.degrees(np.linalg.norm(rotation_log(turn @ true.T))) < 5.0
+
+
+def test_in_flight_a_change_of_spin_costs_more_the_greater_it_is_and_an_impact_may_do_anything() -> None:
+    def cost(change_rad_s: float, flies: bool) -> float:
+        poses = [np.eye(4), np.eye(4), np.eye(4)]
+        poses[2][:3, :3] = rotation_exp(np.array([0, 0, change_rad_s * STEP_S]))
+        return change_cost(tuple(poses), (STEP_S, STEP_S), np.zeros(3), np.zeros(3), MotionConfig(), flying=flies)
+
+    assert cost(20.0, False) < MotionConfig().impact_cost
+    assert cost(20.0, True) > 4 * cost(20.0, False)
+    assert cost(24.0, True) == pytest.approx(4 * cost(12.0, True))
