@@ -27,6 +27,7 @@ from calibration.ground_plane import (
     table_points,
 )
 from calibration.pictures import table_picture
+from calibration.report import Finding
 from calibration.tags.detect import detect_tags
 from calibration.tags.faults import explain_absence
 from calibration.tags.toss_object import solve_toss
@@ -59,6 +60,7 @@ def table(path: Path, args: argparse.Namespace, progress: Progress) -> Done:
         places = camera_from_rig(calibration, list(table_views), COLOR)
         target = table_target(calibration)
         tags_px, hold_out, tags, rig_from_world = None, {}, None, None
+        missing: tuple[Finding, ...] = ()
         if target is not None and any(len(v) >= 4 for v in table_views.values()):
             solved = place_world(models, places, table_views)
             tags_px, rig_from_world = solved.rms_px, solved.scene.rig_from_body[0]
@@ -67,7 +69,7 @@ def table(path: Path, args: argparse.Namespace, progress: Progress) -> Done:
             hold_out = _without_one_camera(models, places, table_views, rig_from_world)
         elif target is not None:
             why = explain_absence(grey_images(session.toss(session.tosses[0]), COLOR)[1], calibration.tag_family)
-            progress.value(f"no table tags found: {why}", 0.0, at=0)
+            missing = (Finding("warning", f"no table tags found: {why}"),)
         depth_points = _depth_points(session)
         height_m = _paper_m(target) if tags is not None else 0.0
         plane, scale, residuals = fit_table(tags, depth_points, height_m)
@@ -75,6 +77,7 @@ def table(path: Path, args: argparse.Namespace, progress: Progress) -> Done:
         plane_world = plane.in_frame(world_from_rig)
         gravity = _gravity(session, args, world_from_rig, progress)
         report = judge_table(plane_world, residuals, hold_out, tags_px, scale, gravity)
+        report = replace(report, findings=(*report.findings, *missing))
         picture = _picture(session, plane_world, world_from_rig, depth_points, scale, target)
         if args.dry_run or report.verdict == "refused":
             return done([report], None, [picture], not args.dry_run)

@@ -116,8 +116,6 @@ def detect_tags(
             lists += found
             done += len(chunk)
             progress.step(done, max(total or done, done), "images searched for tags")
-    if lost:
-        progress.value("images lost to the tag detector", float(len(lost)), at=done)
     return TagLists(lists, lost)
 
 

@@ -75,6 +75,15 @@ def test_the_table_and_the_clock_offset_of_a_toss(cube_copy, cube_truth, capsys)
         assert angle_deg(gap[:3, :3]) < 0.1
 
 
+def test_table_tags_that_no_camera_sees_are_a_warning_of_the_report(cube_copy, capsys):
+    calibration = json.loads((cube_copy / "calibration.json").read_text())
+    for k, tag in enumerate(calibration["table_tags"]):
+        tag["id"] = 500 + k
+    (cube_copy / "calibration.json").write_text(json.dumps(calibration))
+    main(["table", str(cube_copy), "--dry-run"])
+    assert "no table tags found" in capsys.readouterr().out
+
+
 def test_what_is_missing_is_named_with_what_to_type(cube_copy, sample_path, capsys):
     assert main(["time", str(cube_copy)]) == 2
     assert "toss-calibrate cameras" in capsys.readouterr().err
