@@ -67,7 +67,7 @@ def log_likelihood_ratio(
     `one`."""
     use = use & np.isfinite(one[:, 0, 0]) & np.isfinite(other[:, 0, 0])
     views = _views(scene, use)
-    apart = _apart_deg(one[views], other[views])
+    apart = turns_apart_deg(one[views], other[views])
     disputed = apart > config.disputed_deg
     if not disputed.any():
         return 0.0
@@ -118,7 +118,7 @@ def _views(scene: Scene, use: Bool[Array, " n"]) -> Int[Array, " v"]:
     return np.array([run[len(run) // 2] for run in runs], dtype=np.int64)
 
 
-def _apart_deg(one: Float[Array, "v 4 4"], other: Float[Array, "v 4 4"]) -> Float[Array, "v v"]:
+def turns_apart_deg(one: Float[Array, "v 4 4"], other: Float[Array, "v 4 4"]) -> Float[Array, "v v"]:
     """How much two hypotheses differ about the rotation between any two views (degrees)."""
     both = np.swapaxes(one[:, :3, :3], 1, 2) @ other[:, :3, :3]
     cosine = (np.einsum("aij,bij->ab", both, both) - 1) / 2

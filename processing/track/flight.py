@@ -15,6 +15,7 @@ from numpy import ndarray as Array
 
 from processing.motion.rotation_grid import ball
 from processing.sensor import view_layout as lay
+from processing.track.appearance_ratio import turns_apart_deg
 from processing.track.beam import BeamConfig, Hypothesis, Scene, follow
 from processing.track.flight_kernels import SPIN, VELOCITY, fit_flights
 from processing.track.keyframes import is_new
@@ -31,6 +32,8 @@ class FlightConfig:
 
     least_frames: int = 6
     """Shorter ones are not told from a hand's motion."""
+    longest_s: float = 1.2
+    """A throw that flies for longer rises above a ceiling (1.8 m up and down)."""
     off_share: float = 0.1
     """The centre of what is seen wanders about a falling body's centre by so much of its size (root mean square)."""
     off_m_s2: float = 2.0
@@ -50,6 +53,8 @@ class FlightConfig:
     hypotheses: int = 2
     apart_deg: float = 6.0
     """Turns from frame to frame that are nearer are one."""
+    same_deg: float = 4.0
+    """Where all directions of time agree about the turns in a flight so well, nothing is left open."""
     other_deg: float = 20.0
     """A solution that differs by less about all turns between its frames is what the beam found."""
 
@@ -75,7 +80,8 @@ def flying(scene: Scene, count: int, config: FlightConfig) -> Int[Array, " m"]:
     size = float(np.median([_size_m(scene, int(i)) for i in usable]))
     best, least = usable[:0], config.off_share * size
     for a in range(len(usable)):
-        for b in range(len(usable), a + max(config.least_frames, len(best) + 1) - 1, -1):
+        ends = int(np.searchsorted(t, t[a] + config.longest_s))
+        for b in range(ends, a + max(config.least_frames, len(best) + 1) - 1, -1):
             if _falls(centers[a:b], t[a:b], scene.gravity_camera_m_s2, least, config.off_m_s2):
                 best = usable[a:b]
                 break
@@ -92,6 +98,8 @@ def _falls(
     centers_m: Float[Array, "n 3"], t: Float[Array, " n"], gravity: Float[Array, "3"], off_m: float, off_m_s2: float
 ) -> bool:
     """Whether centres lie on a parabola of gravity's, and not just because they are few."""
+    if (np.diff(t) <= 0).any():
+        return False
     t = t - t.mean()
     powers = np.stack([np.ones_like(t), t, 0.5 * t * t], -1)
     free, *_ = np.linalg.lstsq(powers, centers_m, rcond=None)
@@ -188,30 +196,23 @@ def _poses(
 
 
 def flights_followed(
-    scene: Scene, first: int, known: Hypothesis, beam: BeamConfig, config: FlightConfig
+    scene: Scene, first: int, known: Hypothesis, others: list[Hypothesis], beam: BeamConfig, config: FlightConfig
 ) -> list[Hypothesis]:
     """What the beam makes of the solved flights, both ways from each; those that the `known` hypothesis has already are
-    left out."""
+    left out. None where the `others` all agree with it about the flight: then nothing is left open."""
     frames = np.flatnonzero(scene.flying) if scene.flying is not None else np.zeros(0, dtype=np.int64)
     if len(frames) < config.least_frames:
         return []
     begin = (len(frames) - config.solved_frames) // 2
     frames = frames[begin : begin + config.solved_frames]
+    if others and all(turns_apart_deg(known.poses[frames], h.poses[frames]).max() < config.same_deg for h in others):
+        return []
     out = []
     for flight in solved(scene, frames, config):
-        if _turned_apart_deg(known.poses[frames], flight.poses) > config.other_deg:
+        apart = turns_apart_deg(known.poses[frames], flight.poses).max()  # NaN where the other one lacks a pose
+        if not apart <= config.other_deg:
             out.append(_followed(scene, flight, first, beam))
     return out
-
-
-def _turned_apart_deg(one: Float[Array, "m 4 4"], other: Float[Array, "m 4 4"]) -> float:
-    """How much two solutions of a flight differ about the turn between any two frames; infinite where one lacks a
-    pose."""
-    both = np.swapaxes(one[:, :3, :3], 1, 2) @ other[:, :3, :3]
-    if not np.isfinite(both).all():
-        return float("inf")
-    cosine = (np.einsum("aij,bij->ab", both, both) - 1) / 2
-    return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))).max())
 
 
 def _followed(scene: Scene, flight: Flight, first: int, beam: BeamConfig) -> Hypothesis:

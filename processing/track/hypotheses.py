@@ -218,6 +218,16 @@ def apart_deg(one: Float[Array, "n 4 4"], other: Float[Array, "n 4 4"]) -> float
     return float(max(_rotations_deg(one, other), default=0.0))
 
 
+def anchored_to(hypothesis: Hypothesis, other: Hypothesis, first: int) -> Hypothesis:
+    """The hypothesis in the object frame in which the first frame's pose is that of the other one."""
+    if not np.isfinite(hypothesis.poses[first, 0, 0]):
+        return hypothesis
+    own_from_other = np.linalg.inv(hypothesis.poses[first]) @ other.poses[first]
+    poses = hypothesis.poses @ own_from_other
+    poses[first] = other.poses[first]
+    return replace(hypothesis, poses=poses)
+
+
 def refined(
     scene: Scene, best: Hypothesis, first: int, keep_first: bool, config: HypothesisConfig, axis: Axis | None = None,
     held: bool = False,

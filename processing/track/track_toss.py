@@ -30,7 +30,7 @@ from processing.track.flags import (
     unjoined_uncertainty,
 )
 from processing.track.flight import FlightConfig, flights_followed, flying
-from processing.track.hypotheses import HypothesisConfig, TrajectoryHypothesis, apart_deg, select
+from processing.track.hypotheses import HypothesisConfig, TrajectoryHypothesis, anchored_to, apart_deg, select
 from processing.track.keyframes import is_new
 from processing.track.known_shape import ShapeConfig, ShapeViews, center_of, located, shape_views
 from recordings.errors import BadInput
@@ -261,7 +261,8 @@ def _followed(
 ) -> tuple[list[Hypothesis], float, dict[int, list[Candidate]]]:
     """Hypotheses of the same frames: the beam forward, then once more backward with all that forward learned as the
     model; a beam backward that knows nothing of the first but where the last frame is; and the beam forward itself,
-    where both backward ones differ from it."""
+    where both backward ones differ from it. Where they leave its flight open, that
+    solved as one adds its own."""
     n = len(scene.times_s)
 
     def report(i: int, beam: list[Hypothesis]) -> None:
@@ -278,15 +279,11 @@ def _followed(
     if known.model is None and last > first + 1:
         fresh = started(scene.store, n, last, best.poses[last])
         hypotheses.append(
-            _anchored(follow(scene, np.arange(last - 1, first - 1, -1), [fresh], narrow).best, best, first)
+            anchored_to(follow(scene, np.arange(last - 1, first - 1, -1), [fresh], narrow).best, best, first)
         )
         if all(apart_deg(best.poses[:n], s.poses[:n]) > config.separate_deg for s in hypotheses):
             hypotheses.append(best)
-        through = [_anchored(h, best, first) for h in flights_followed(scene, first, best, narrow, config.flight)]
-        hypotheses += [
-            h for h in through
-            if all(apart_deg(h.poses[:n], s.poses[:n]) > config.separate_deg for s in hypotheses)
-        ]  # fmt: skip
+        hypotheses += _through_flights(scene, first, best, hypotheses, narrow, config)
     out = []
     for hypothesis in hypotheses:
         if any(scene.store.usable(i) for i in range(first)):
@@ -296,14 +293,18 @@ def _followed(
     return out, ahead.margin, ahead.rejected
 
 
-def _anchored(hypothesis: Hypothesis, other: Hypothesis, first: int) -> Hypothesis:
-    """The hypothesis in the object frame in which the first frame's pose is that of the other one."""
-    if not np.isfinite(hypothesis.poses[first, 0, 0]):
-        return hypothesis
-    own_from_other = np.linalg.inv(hypothesis.poses[first]) @ other.poses[first]
-    poses = hypothesis.poses @ own_from_other
-    poses[first] = other.poses[first]
-    return replace(hypothesis, poses=poses)
+def _through_flights(
+    scene: Scene, first: int, best: Hypothesis, others: list[Hypothesis], beam: BeamConfig, config: TrackConfig
+) -> list[Hypothesis]:
+    """What the beam makes of the flight solved as one, where that is none of the others."""
+    n = len(scene.times_s)
+    found = [anchored_to(h, best, first) for h in flights_followed(scene, first, best, others, beam, config.flight)]
+    return [
+        h
+        for h in found
+        if np.isfinite(h.poses[first, 0, 0])
+        and all(apart_deg(h.poses[:n], s.poses[:n]) > config.separate_deg for s in others)
+    ]
 
 
 def _starts(scene: Scene, first: int, known: _Known, config: TrackConfig) -> tuple[list[Hypothesis], BeamConfig]:

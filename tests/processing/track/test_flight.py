@@ -76,6 +76,11 @@ def test_without_gravity_nothing_is_known_to_fly(scene: Scene) -> None:
     assert len(flying(nowhere, len(scene.times_s), FlightConfig())) == 0
 
 
+def test_frames_whose_times_do_not_grow_fly_nowhere(scene: Scene) -> None:
+    stopped = replace(scene, times_s=np.zeros_like(scene.times_s))
+    assert len(flying(stopped, len(scene.times_s), FlightConfig())) == 0
+
+
 def test_a_spin_of_34_degrees_a_frame_is_found_among_all(scene: Scene, tiny_world: Any) -> None:
     best = solved(scene, np.arange(HELD + 1, HELD + 6), FlightConfig())[0]
     true = tiny_world.world_from_camera.inverse().vectors(SPIN[None])[0]
@@ -86,8 +91,9 @@ def test_the_beam_goes_on_from_a_solved_flight_both_ways(scene: Scene, tiny_worl
     n, camera = len(scene.times_s), tiny_world.world_from_camera.rotation
     fly = replace(scene, flying=np.isin(np.arange(n), flying(scene, n, FlightConfig())))
     nothing = started(scene.store, n, 0, first_pose(scene.store, 0))
-    best = flights_followed(fly, 0, nothing, TrackConfig().beam, FlightConfig())[0]
+    best = flights_followed(fly, 0, nothing, [], TrackConfig().beam, FlightConfig())[0]
     assert best.tracked == tuple(range(n))
+    assert flights_followed(fly, 0, best, [best], TrackConfig().beam, FlightConfig()) == []  # all agree already
     for i in range(HELD + 1, n):
         turn = best.poses[i, :3, :3] @ best.poses[HELD, :3, :3].T
         true = camera.T @ thrown(i).rotation @ thrown(HELD).rotation.T @ camera
