@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
+import math
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -41,7 +42,13 @@ def file_sha256(path: Path) -> str:
 
 def without_nan(value: Any) -> Any:
     """A JSON value as strict JSON has it: null where a number is NaN or infinite, lists for tuples."""
-    return json.loads(json.dumps(value, default=float), parse_constant=lambda _: None)
+    if isinstance(value, Mapping):
+        return {str(key): without_nan(inner) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [without_nan(inner) for inner in value]
+    if value is None or isinstance(value, bool | int | str):
+        return value
+    return float(value) if math.isfinite(value) else None
 
 
 def json_bytes(document: Mapping[str, Any]) -> bytes:

@@ -43,6 +43,7 @@ KERNELS: dict[tuple[str, str], list[tuple[str, ...]]] = {
     ("processing.track.registration.consistency_kernels", "consistency_terms"): [
         (T, MI, M4, M4, VI, VI, MI, V, V, V, "boolean", T, M, M)
     ],
+    ("processing.track.flight_kernels", "fit_flights"): [(M, MI, V, V, M4, M4, MI, V, V, M)],
     ("processing.track.appearance_ratio", "_appearance_at"): [(M4, M, M4, VI, V, V, F8, M)],
     ("processing.contact.physics.steps_cpu", "roll_rows"): [ROLL],
     ("processing.contact.physics.solver_cpu", "solve_rows"): [(T, M, F8, M, F8, I8, F8, I8)],
