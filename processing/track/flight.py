@@ -89,9 +89,7 @@ def flying(scene: Scene, count: int, config: FlightConfig) -> Int[Array, " m"]:
 
 
 def _size_m(scene: Scene, view: int) -> float:
-    row = scene.store.table[view]
-    points = scene.store.samples[row[lay.FIRST] : row[lay.FIRST] + row[lay.COUNT], :3]
-    return float(np.linalg.norm(np.ptp(points, axis=0)))
+    return float(np.linalg.norm(np.ptp(_points(scene, view), axis=0)))
 
 
 def _falls(

@@ -124,9 +124,10 @@ def _is_rather_round(
 ) -> bool:
     """Whether a round body explains the views about as well as free ones do: its one profile leaves it less freedom,
     its azimuths must not contradict what is printed on it."""
-    n, worse = len(scene.times_s), float(np.log(sought.cost / free.cost) / np.log(config.round_cost))
-    if worse >= 1.0:
+    if sought.cost >= config.round_cost * free.cost:
         return False
+    n, ratio = len(scene.times_s), max(sought.cost, 1e-9) / free.cost
+    worse = float(np.log(ratio) / np.log(config.round_cost))
     nats = log_likelihood_ratio(
         scene, free.joint.poses[:n], sought.joint.poses[:n], free.use & sought.use, config.appearance
     )
