@@ -113,7 +113,7 @@ def calibrate_hand_eye(
     solved = _refine(observations, start, arm)
     hold_out = _hold_out(observations, (solved.camera_from_mount, solved.held_from_board), arm)
     findings = [Finding("refused", text) for text in missing] + _judge(solved, hold_out, len(used))
-    mm, deg = _spread(solved.covariance)
+    mm, deg = _std_mm_deg(solved.covariance)
     report = Report(
         f"hand-eye ({mounting})",
         {"rms_px": solved.rms_px, "robot_deg": solved.robot_deg, "robot_mm": solved.robot_mm, "poses": len(used)},
@@ -325,14 +325,14 @@ def _hold_out(observations: _Observations, start: tuple[Array, Array], arm: ArmA
     return {"rms_px": rms, "median_mm": float(np.median(shifts)), "median_deg": float(np.median(turns))}
 
 
-def _spread(covariance: Float[Array, "6 6"]) -> tuple[float, float]:
+def _std_mm_deg(covariance: Float[Array, "6 6"]) -> tuple[float, float]:
     """Standard deviations in mm and deg, as lengths."""
     variance = np.diag(covariance)
     return 1e3 * float(np.sqrt(variance[3:].sum())), float(np.degrees(np.sqrt(variance[:3].sum())))
 
 
 def _judge(solved: _Refined, hold_out: dict[str, float], poses: int) -> list[Finding]:
-    mm, deg = _spread(solved.covariance)
+    mm, deg = _std_mm_deg(solved.covariance)
     found = limit(solved.rms_px, "the residual", "px", GOOD_PX, WORST_PX)
     found += limit(mm, "the standard deviation of the camera's position", "mm", GOOD_MM, WORST_MM)
     found += limit(deg, "the standard deviation of the camera's direction", "deg", GOOD_DEG, WORST_DEG)

@@ -80,7 +80,7 @@ class D455Refinement:
         return {
             "frames": self.frames,
             "corner_px": self.corner_px,
-            "sightings_at_sure_poses": self.detections,
+            "detections_at_sure_poses": self.detections,
             "camera_off_m": self.off_m,
             "camera_off_rad": self.off_rad,
             "mono_offset_ms": 1e3 * self.offset_s,

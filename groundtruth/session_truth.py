@@ -271,7 +271,7 @@ def truth_document(truth: SessionTruth, object_from_tagged: Transform | None) ->
         },
         "center_of_mass_tagged_m": solved.center_m.tolist(),
         "frames": {str(toss): {s: t.status.count(s) for s in get_args(Status)} for toss, t in truth.tosses.items()},
-        **({"d455_witness": truth.d455_refinement.document()} if truth.d455_refinement is not None else {}),
+        **({"d455_refinement": truth.d455_refinement.document()} if truth.d455_refinement is not None else {}),
         "verdict": truth.verdict.document(),
     }
 

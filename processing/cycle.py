@@ -19,7 +19,7 @@ from processing.stages.joint import solve_together
 from processing.stages.judge import judge, residuals
 from processing.stages.register import register
 from processing.stages.reproject import drawn_images, reproject
-from processing.stages.rollouts import roll_out
+from processing.stages.rollout import roll_out
 from processing.stages.track import track
 from processing.store import Done
 from processing.variants import Variant

@@ -15,16 +15,18 @@ from processing.images import Images, every_frame, raw_images
 from processing.passes import Pass
 from processing.record import write_record
 from processing.run import Run, each
-from processing.stages.baseline import track_to_model
 from processing.stages.field import learn_field
 from processing.stages.find import find_object
 from processing.stages.lose import lose, without_lost
 from processing.stages.model import bring_model
-from processing.stages.rig import refine_rig, with_depth_in_time
-from processing.stages.rollouts import roll_out
-from processing.stages.scene import learn_static_scene, measure_noise
+from processing.stages.recording.depth_delay import with_depth_in_time
+from processing.stages.recording.noise import measure_noise
+from processing.stages.recording.rig import refine_rig
+from processing.stages.recording.scene import learn_static_scene
+from processing.stages.rollout import roll_out
 from processing.stages.segment import segment
 from processing.stages.track import track
+from processing.stages.track_to_model import track_to_model
 from processing.store import Done
 from processing.variants import Variant
 from recordings.results.folder import Scope, VariantRecord

@@ -8,10 +8,10 @@ from collections.abc import Mapping
 from processing import stage_notices as say
 from processing.passes import Pass
 from processing.run import Run
-from processing.stages.rig import RigResult
-from processing.stages.scene import SceneResult, scene_notes
+from processing.stages.recording.every_frame import in_every_frame
+from processing.stages.recording.rig import RigResult
+from processing.stages.recording.scene import SceneResult, scene_notes
 from processing.stages.segment import SegmentResult
-from processing.stages.still import in_every_frame
 from processing.store import Done, locked
 from processing.variants import Variant
 from recordings.notices import in_order

@@ -10,10 +10,10 @@ from processing.refine.image_residuals import Difference
 from processing.run import Run
 from processing.sensor.noise import PUBLISHED
 from processing.stages.lose import SEE
+from processing.stages.recording.noise import NoiseResult
+from processing.stages.recording.rig import RigResult
 from processing.stages.register import RegisterResult
-from processing.stages.rig import RigResult
-from processing.stages.rollouts import RolloutResult
-from processing.stages.scene import NoiseResult
+from processing.stages.rollout import RolloutResult
 from processing.stages.segment import SegmentResult
 from processing.stages.track import TrackResult
 from processing.store import Done

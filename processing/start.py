@@ -13,8 +13,8 @@ from processing.engine.each import Engine
 from processing.run import CAMERA, MakeProgress, Run
 from processing.segment.background.static_scene import StaticScene
 from processing.sensor.table_plane import with_table_from_depth
-from processing.stages.scene import learn_static_scene
-from processing.stages.still import without_waiting
+from processing.stages.recording.scene import learn_static_scene
+from processing.stages.recording.still import without_waiting
 from processing.store import Store
 from recordings.errors import BadInput
 from recordings.notices import Notice

@@ -35,7 +35,7 @@ KERNELS: dict[tuple[str, str], list[tuple[str, ...]]] = {
     (PROFILE, "outline_points"): [(M, M, V, V, VB, VI, V, M)],
     (AZIMUTH, "descend"): [(VI, M, MI, *MOTION, I8, I8)],
     (AZIMUTH, "greedy"): [(I8, M, MI, *MOTION)],
-    (AZIMUTH, "spreads"): [(VI, M, MI, *MOTION)],
+    (AZIMUTH, "variances"): [(VI, M, MI, *MOTION)],
     (AZIMUTH, "energy"): [(VI, M, MI, *MOTION)],
     (AZIMUTH, "add_appearance_ratio"): [(Q, T, T, MI, V, F8, F8, I8, M)],
     (AZIMUTH, "add_shape_ratio"): [(T, Q, T, MI, F8, F8, I8, M)],

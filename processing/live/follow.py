@@ -212,7 +212,7 @@ class _Follower:
         self.done[toss] = file
         try:
             joined = self.together.add(self.looker.look(toss, file, step))
-            step("told")
+            step("joined")
         except TossGone:
             self._forget(toss, "was taken away while it was looked at")
         except (TosslabError, OSError) as wrong:

@@ -21,10 +21,10 @@ from processing.run import CAMERA, Run
 from processing.sensor.still import Kept, ThinnedSession
 from processing.stages.find import find_object
 from processing.stages.lose import without_lost
-from processing.stages.rig import RigResult, refine_rig
-from processing.stages.scene import SceneResult, learn_static_scene
+from processing.stages.recording.rig import RigResult, refine_rig
+from processing.stages.recording.scene import SceneResult, learn_static_scene
+from processing.stages.recording.still import without_waiting
 from processing.stages.segment import segment
-from processing.stages.still import without_waiting
 from processing.store import Done, Store
 from processing.track.track_toss import TossTrack, track_toss
 from recordings.errors import BadInput

@@ -116,12 +116,12 @@ def _noise(blocks: Sequence[_Blocks], settings: StillSettings) -> tuple[float, f
     """Standard deviation of the difference of a block between two frames at rest, in colour and in inverse depth."""
     pairs = zip(blocks, blocks[1:])
     differences = [_difference(a, b) for a, b in pairs]
-    color = float(np.nanmedian([settings.color_noise[0], *(_spread(c) for c, _ in differences)]))
-    depth = float(np.nanmedian([settings.depth_noise[0], *(_spread(d) for _, d in differences)]))
+    color = float(np.nanmedian([settings.color_noise[0], *(_noise_of_differences(c) for c, _ in differences)]))
+    depth = float(np.nanmedian([settings.depth_noise[0], *(_noise_of_differences(d) for _, d in differences)]))
     return float(np.clip(color, *settings.color_noise)), float(np.clip(depth, *settings.depth_noise))
 
 
-def _spread(values: Float32[Array, "..."]) -> float:
+def _noise_of_differences(values: Float32[Array, "..."]) -> float:
     known = values[np.isfinite(values)]
     return MAD_TO_SIGMA * float(np.median(np.abs(known))) if len(known) else float("nan")
 

@@ -30,7 +30,7 @@ def learn_field(
 ) -> Done[FieldResult]:
     """O. Where no frame looks it is the shape `prior_shape`, if there is one (else the hull of what was seen)."""
     inputs = {"for": name, **track_and_image_keys(tracks, images)}
-    inputs |= {} if prior_shape is None else {"believed": prior_shape.key}  # the name that stored keys were made with
+    inputs |= {} if prior_shape is None else {"prior_shape": prior_shape.key}
     config = _with_noise(run.config.shape, run.noise)
 
     def compute(folder: Path) -> FieldResult:

@@ -36,4 +36,4 @@ def fuse_frames(run: Run, together: Done, images: Mapping[int, Images], tosses: 
         write_shape(folder, grid_mesh(fuse(views, run.config.shape.field.fuse), seen[0].track.object_frame))
         return FuseResult(tuple(tosses), len(views))
 
-    return run.store.run("fused", VERSION, run.config.shape.field.fuse, inputs, FuseResult, compute)
+    return run.store.run("fuse", VERSION, run.config.shape.field.fuse, inputs, FuseResult, compute)

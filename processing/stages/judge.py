@@ -49,7 +49,7 @@ def judge(
         with open(folder / "residuals.npz", "wb") as out:
             np.savez(out, rows=every.rows)
         found = every.means()
-        write_json(folder / "evidence.json", found.to_json())
+        write_json(folder / "means.json", found.to_json())
         depth_m, mask, color = (x if np.isfinite(x) else None for x in (found.depth_m, found.mask, found.color))
         return JudgeResult(depth_m, mask, color, found.frames, found.lost)
 

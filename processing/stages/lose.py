@@ -1,4 +1,4 @@
-"""Stage `track` of a toss in which the object is not seen: every frame is lost, and counted."""
+"""Stage `lose`, for a toss in which the object is not seen: every frame is lost, and counted."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def lose(run: Run, toss: int, masks: Done) -> Done[TrackResult]:
         return TrackResult(len(times_ns), 0, len(times_ns))
 
     inputs = {"masks": masks.key, **toss_keys(run, toss)}
-    return run.store.run("track", VERSION, {"lost": True}, inputs, TrackResult, compute)
+    return run.store.run("lose", VERSION, {}, inputs, TrackResult, compute)
 
 
 def without_lost(run: Run, masks: Mapping[int, Done[SegmentResult]]) -> Run:

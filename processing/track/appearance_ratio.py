@@ -75,7 +75,7 @@ def log_likelihood_ratio(
     usual = _Usual.of(np.concatenate([_appearance(scene.store, int(i)) for i in views]), sigma)
     ratios = []
     for a in np.flatnonzero(disputed.any(1)):
-        others = views[_spread(np.flatnonzero(disputed[a]), config.most_views)]
+        others = views[_evenly_chosen(np.flatnonzero(disputed[a]), config.most_views)]
         ratio = [_predicted(scene.store, poses, int(views[a]), others, sigma, usual, config) for poses in (one, other)]
         ratios.append(np.clip(config.gain * (ratio[0] - ratio[1]), -config.most, config.most))
     mean = float(np.mean(ratios))
@@ -125,7 +125,7 @@ def turns_apart_deg(one: Float[Array, "v 4 4"], other: Float[Array, "v 4 4"]) ->
     return np.asarray(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
 
 
-def _spread(places: Int[Array, " p"], most: int) -> Int[Array, " q"]:
+def _evenly_chosen(places: Int[Array, " p"], most: int) -> Int[Array, " q"]:
     return places[np.unique(np.linspace(0, len(places) - 1, most).round().astype(int))]
 
 
@@ -145,7 +145,7 @@ def _usual_difference(
     gaps = [np.zeros((0, APPEARANCE))]
     for a in range(len(views)):
         far = np.flatnonzero((apart[a] < config.agreed_deg) & (steps[a] >= config.far_steps))
-        for b in _spread(far, config.most_views) if len(far) else far:
+        for b in _evenly_chosen(far, config.most_views) if len(far) else far:
             seen = _seen(store, poses, int(views[a]), int(views[b]), config)
             gaps.append((seen - _appearance(store, int(views[a])))[np.isfinite(seen[:, 0])])
     every = np.abs(np.concatenate(gaps))

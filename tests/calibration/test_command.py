@@ -1,4 +1,4 @@
-"""`toss-calibrate` on cube_dev: what it writes, what it refuses, what it says. Truth: data/README.md, section 1."""
+"""`toss-calibrate` on cube_dev: what it writes, what it refuses, what it says. Truth: the camera poses that came with the recording."""
 
 from __future__ import annotations
 

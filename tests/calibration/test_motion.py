@@ -146,7 +146,7 @@ def ballistic(geometry, count=40, period=1 / 30, start=0.0, seed=0):
 
 
 @pytest.mark.parametrize("offset_ms", [0.0, 7.3, -21.0])
-def test_an_offset_between_two_courses_is_found_within_its_deviation(geometry, offset_ms):
+def test_an_offset_between_two_trajectories_is_found_within_its_deviation(geometry, offset_ms):
     times, poses, at = ballistic(geometry)
     rng = np.random.default_rng(1)
     others = 0.011 + times[:-2]

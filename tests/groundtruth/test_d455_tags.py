@@ -119,7 +119,7 @@ def test_a_whole_recorded_toss_is_found_impacts_included(data, tmp_path, capsys)
     assert calibrate_main(["cameras", str(session)]) == 0
     capsys.readouterr()
     assert main([str(session), "--toss", "0", "--tag-size", "0.06140625", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["d455_witness"]["frames"] >= 10
+    assert json.loads(capsys.readouterr().out)["d455_refinement"]["frames"] >= 10
     found = Toss(session / "truth" / "toss_00.mcap").poses("/groundtruth/pose")
     with np.load(data("cube_dev_truth") / "toss_00" / "poses_camera_object.npz") as stored:
         gap_m, turn_rad = after_one_offset(found, stored["T_world_object"])

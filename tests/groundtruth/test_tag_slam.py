@@ -195,7 +195,7 @@ def wall_with_two_tags(minimum_area: float = 0.0, second_size_m: float = 0.3):
 FACING = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
-def test_a_tag_that_only_drifting_odometry_reaches_is_placed_and_then_agrees_with_all_its_sightings():
+def test_a_tag_that_only_drifting_odometry_reaches_is_placed_and_then_agrees_with_all_its_detections():
     config, recording, second = wall_with_two_tags()
     result = run_tag_slam(config, recording)
     assert result.unplaced == ()
@@ -210,7 +210,7 @@ def test_small_tags_start_nothing():
     assert 2 not in run_tag_slam(config, recording).tags
 
 
-# median reprojection of TagSLAM's own reference poses in px (README of the data, section 3)
+# median reprojection of TagSLAM's own reference poses in px (as its data state them)
 REFERENCE_PX = {"01": 0.39, "02": 0.34, "07": 0.97, "16": 0.07, "17": 0.08, "23": 0.34}
 SLOW = ("02", "07", "11")
 

@@ -143,15 +143,15 @@ def stage(folder: Path, name: str, result: Any = None) -> Done:
     return Done(folder / name, name, result, reused=True)
 
 
-@pytest.mark.parametrize(("grown_m", "kept_out"), [(4e-4, True), (2e-5, False)])
+@pytest.mark.parametrize(("larger_m", "kept_out"), [(4e-4, True), (2e-5, False)])
 def test_contact_that_makes_the_shape_worse_on_raw_depth_is_kept_out_and_said(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, grown_m: float, kept_out: bool
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, larger_m: float, kept_out: bool
 ) -> None:
     vision, tracks = (stage(tmp_path, n) for n in ("field", "register"))
     learned = stage(tmp_path, "contact", ContactResult(0.2))
 
     def judged(run: Any, name: str, tracks: Any, shapes: Any, images: Any) -> Done:
-        worse_m = grown_m if shapes[0] is learned else 0.0
+        worse_m = larger_m if shapes[0] is learned else 0.0
         done = stage(tmp_path, f"judge-{shapes[0].key}", JudgeResult(None, None, None, 24, 0))
         found = rows(1.4e-3 + worse_m + 1e-5 * np.sin(np.arange(24)))
         np.savez(done.folder / "residuals.npz", rows=found.rows)

@@ -77,7 +77,7 @@ def test_results_come_in_the_order_of_the_items_however_the_calls_are_nested(thr
     assert list(found.items()) == [(2, [23, 21]), (0, [3, 1]), (1, [13, 11])]
 
 
-def test_no_more_are_computed_at_once_than_there_are_lanes(three: SideBySide) -> None:
+def test_no_more_are_computed_at_once_than_there_are_slots(three: SideBySide) -> None:
     three.each(
         range(4), lambda a: three.each(range(4), lambda b: three.run(task(f"{a}.{b}", lambda: time.sleep(0.01))))
     )

@@ -21,8 +21,8 @@ from processing.run import Run
 from processing.stages.contact import learn_contact
 from processing.stages.find import find_object
 from processing.stages.held_out import Half, halves_of, judge_by_contact, losses_of, why_not_by_contact
-from processing.stages.rig import refine_rig
-from processing.stages.scene import learn_static_scene
+from processing.stages.recording.rig import refine_rig
+from processing.stages.recording.scene import learn_static_scene
 from processing.stages.segment import segment
 from processing.start import start_run
 from processing.store import Done

@@ -23,9 +23,9 @@ from processing.field.learn import LearnConfig
 from processing.field.train import FieldConfig
 from processing.run import Run
 from processing.sensor.noise import PUBLISHED
+from processing.stages.recording.noise import NoiseResult
+from processing.stages.recording.rig import RigResult
 from processing.stages.register import RegisterResult
-from processing.stages.rig import RigResult
-from processing.stages.scene import NoiseResult
 from processing.stages.segment import SegmentResult
 from processing.stages.track import TrackResult
 from processing.store import Done

@@ -209,7 +209,7 @@ CASES = [
     ("residuals", "residuals.npz", hostile.npz_bomb, "unpack to 1258291328 bytes"),
     ("rig of a session", "rig.json", hostile.nested_json, "nested deeper than 100 levels"),
     ("rig of a session", "rig.json", hostile.json_of_nothing, "lacks 'camera_from_base'; remove its folder"),
-    ("detection", "sightings.json", hostile.nested_json, "nested deeper than 100 levels"),
+    ("detection", "detections.json", hostile.nested_json, "nested deeper than 100 levels"),
     ("calibration", "calibration.json", hostile.three_gigabytes, "a JSON document of 3221225472 bytes"),
     ("session", "session.json", hostile.three_gigabytes, "a JSON document of 3221225472 bytes"),
     ("rig file", "lab.toml", hostile.three_gigabytes, "a rig file of 3221225472 bytes"),

@@ -202,7 +202,7 @@ def believed(spec: Spec, scene: Scene) -> tuple[CameraModel, Transform]:
     return camera, scene.world_from_camera @ small_error("d455", wrong.camera_m, wrong.camera_deg, rng)
 
 
-def believed_base(spec: Spec, scene: Scene) -> Transform:
+def calibrated_base(spec: Spec, scene: Scene) -> Transform:
     """world_from_base as the session says it: the hand-eye calibration is off."""
     assert scene.arm is not None
     wrong, rng = spec.wrong, generator(spec, WRONG, 1)
@@ -214,7 +214,7 @@ def _session_files(made: Made, ground: Ground) -> None:
     camera, place = believed(spec, scene)
     arm = {}
     if scene.arm is not None:
-        arm = {"arm": "franka_panda", "T_world_base": believed_base(spec, scene).matrix.tolist()}
+        arm = {"arm": "franka_panda", "T_world_base": calibrated_base(spec, scene).matrix.tolist()}
         _json(made.truth / "calibration.json", {
             "T_world_base": scene.arm.world_from_base.matrix.tolist(),
             "T_world_d455": scene.world_from_camera.matrix.tolist(), "arm_clock_offset_s": spec.wrong.arm_clock_s,

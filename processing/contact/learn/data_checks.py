@@ -121,7 +121,7 @@ def _parabola(series: PoseSeries, first: int, frames: int, noise_m: float) -> tu
     return left, Fall(float(fit[2, 2]), error)
 
 
-class Contradiction(BadInput):
+class InconsistentPoses(BadInput):
     """Poses that break a law of mechanics. Imported ones were read wrongly, which the message says; `of_own_tracks` is
     what to say where they are vision's: nobody read them wrongly, so something that was measured is off."""
 
@@ -135,7 +135,7 @@ def of_own_tracks() -> Iterator[None]:
     """Around all that learns from vision's own tracks: what is said of a contradiction is what is true of those."""
     try:
         yield
-    except Contradiction as wrong:
+    except InconsistentPoses as wrong:
         raise BadInput(wrong.of_own_tracks) from wrong
 
 
@@ -152,7 +152,7 @@ def check_fall(tosses: Sequence[PoseSeries]) -> float | None:
         raise BadInput(f"free fall accelerates upwards ({fall:.2f} m/s^2): z of `world` must point up, against gravity")
     step, scale = tosses[0].step_s, GRAVITY_M_S2 / -fall
     reads = f"free fall reads {-fall:.2f} m/s^2 instead of {GRAVITY_M_S2} (+- {found.error:.2f})"
-    raise Contradiction(
+    raise InconsistentPoses(
         f"{reads}: either the time step is wrong ({step * 1e3:.3f} ms is said, {step * 1e3 / scale**0.5:.3f} ms would "
         f"fit) or the scale (1 m in the data would be {scale:.4f} m); import it again with the right `--dt` or "
         "`--scale`",
@@ -202,7 +202,7 @@ def check_orientations(tosses: Sequence[PoseSeries], inertia: Float[Array, "3 3"
     for name, read in READINGS.items():
         other, _ = impact_angle([read(s) for s in tosses], inertia)
         if here > 0.3 and other < 0.6 * here:
-            raise Contradiction(
+            raise InconsistentPoses(
                 f"impacts do not fit the orientations (misfit {here:.2f}), but they do ({other:.2f}) when the "
                 f"rotations are {name}; import the data again in that reading",
                 f"at impacts the tracked object does not turn as a rigid body that is hit would (misfit {here:.2f}, "

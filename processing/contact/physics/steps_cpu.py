@@ -27,7 +27,7 @@ FASTEST_RAD_S, FASTEST_M_S = 150.0, 30.0
 """Beyond any toss: keeps the numbers of a hopeless state finite."""
 EPSILON, TOLERANCE = 1e-4, 1e-6
 """As rollout.py has them."""
-SETTLED_M_S, MOST_ROUNDS = 0.002, 5
+CONVERGED_M_S, MOST_ROUNDS = 0.002, 5
 """The lift is right when it stays within this; sliding that turns within the step may swing on."""
 
 
@@ -131,7 +131,7 @@ def _solve(A, q, count, primal, impulse, inner, lift):
             change = max(change, abs(wanted - lift[c]))
             q[3 * c + 2] += wanted - lift[c]
             lift[c] = wanted
-        if change <= SETTLED_M_S:
+        if change <= CONVERGED_M_S:
             break
     return solved
 

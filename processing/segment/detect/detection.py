@@ -192,7 +192,7 @@ def clearest(tracklet: Tracklet) -> Candidate:
 
 
 def write_detections(folder: Path, found: Mapping[int, Detection]) -> None:
-    """Into a stage's folder: sightings.json, and the rough masks as toss_XX/<position>.png (0 or 255)."""
+    """Into a stage's folder: detections.json, and the rough masks as toss_XX/<position>.png (0 or 255)."""
     document: dict[str, Any] = {}
     for toss, detection in found.items():
         spans = {str(i): list(span) for i, span in detection.spans.items()}
@@ -201,14 +201,14 @@ def write_detections(folder: Path, found: Mapping[int, Detection]) -> None:
         (folder / f"toss_{toss:02d}").mkdir()
         for position, mask in detection.masks.items():
             cv2.imwrite(str(folder / f"toss_{toss:02d}" / f"{position:06d}.png"), mask.astype(np.uint8) * 255)
-    (folder / "sightings.json").write_text(json.dumps(document, indent=1) + "\n")
+    (folder / "detections.json").write_text(json.dumps(document, indent=1) + "\n")
     if found:
         np.save(folder / "shares.npy", next(iter(found.values())).shares)
 
 
 def read_detection(folder: Path, toss: int) -> Detection | None:
     """One toss's, from a stage's folder; None where the object was not found in it."""
-    path, shares_path = folder / "sightings.json", folder / "shares.npy"
+    path, shares_path = folder / "detections.json", folder / "shares.npy"
     entry = stage_document(path).get(str(toss))
     if entry is None:
         return None

@@ -43,7 +43,7 @@ class RobotSettings:
     """So near to the drawn robot, the object's colours are distinguished from the robot's."""
     agrees_m: float = 0.010
     """Measured depth this near to the drawn one (or 4 standard deviations) is the robot."""
-    looks: int = 5
+    sampled: int = 5
     """Frames of a toss from which the robot's colours are learned."""
 
 
@@ -138,7 +138,7 @@ class RobotFrames(Sequence[Bool[Array, "h w"]]):
     def shares(self) -> Float[Array, " b"]:
         """How often each colour is seen on the robot, over some frames of the toss."""
         found = []
-        for i in np.unique(np.linspace(0, len(self) - 1, self.settings.looks).round().astype(int)):
+        for i in np.unique(np.linspace(0, len(self) - 1, self.settings.sampled).round().astype(int)):
             frame = self._frames[int(i)]
             seen = self._draw(frame)
             if seen is not None and (inner := cv2.erode(seen.certain.astype(np.uint8), kernel(3)) > 0).any():
@@ -187,7 +187,7 @@ def with_robot(scene: StaticScene, frame: RgbdFrame, seen: RobotSeen, s: RobotSe
     drawn = np.where(seen.at_color_m > 0, np.where(seen.depth_m > 0, seen.depth_m, seen.at_color_m), 0)
     behind = (scene.depth_m > 0) & scene.known & (scene.depth_m < drawn - 0.03)  # something that stands before it
     drawn = np.where(behind, 0, drawn).astype(np.float32)
-    spread = _spread(seen.depth_m, s.rim_px)
+    spread = _carried_over_outline(seen.depth_m, s.rim_px)
     agrees = np.abs(frame.depth_m - spread) < np.maximum(s.agrees_m, 4 * stereo_sigma_m(spread))
     rim = (drawn == 0) & (spread > 0) & (frame.depth_m > 0) & agrees & ~behind
     depth = np.where(drawn > 0, drawn, np.where(rim, spread, scene.depth_m)).astype(np.float32)
@@ -195,7 +195,7 @@ def with_robot(scene: StaticScene, frame: RgbdFrame, seen: RobotSeen, s: RobotSe
     return replace(scene, depth_m=depth, known=scene.known & ((drawn == 0) | stays))
 
 
-def _spread(depth_m: Float32[Array, "h w"], radius_px: int) -> Float32[Array, "h w"]:
+def _carried_over_outline(depth_m: Float32[Array, "h w"], radius_px: int) -> Float32[Array, "h w"]:
     """Depth carried over the outline: the nearest within the radius."""
     far = np.where(depth_m > 0, depth_m, np.float32(100))
     least = cv2.erode(far, kernel(radius_px), borderType=cv2.BORDER_REPLICATE)

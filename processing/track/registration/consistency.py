@@ -182,8 +182,8 @@ class Inconsistency:
         not; that of an object that is the same all over says nothing.
         """
         f, own = self._figures(self.both.poses(common_from_own), self.pairs), self.itself
-        apart = [_mean(x, c.BESIDE, c.COUNTED) + _mean(x, c.BEFORE, c.COUNTED) for x in (f, own)]
-        rim = [_mean(x, c.FIGURES + c.BESIDE, c.FIGURES + c.COUNTED) for x in (f, own)]
+        apart = [_mean(x, c.OUTSIDE, c.COUNTED) + _mean(x, c.BEFORE, c.COUNTED) for x in (f, own)]
+        rim = [_mean(x, c.FIGURES + c.OUTSIDE, c.FIGURES + c.COUNTED) for x in (f, own)]
         shared = _mean(f, c.SHARED, c.COUNTED)
         depth = _mean(f, c.DEPTH, c.SHARED) - _mean(own, c.DEPTH, c.SHARED)
         appearance = _against(

@@ -16,7 +16,7 @@ from processing.motion import se3_kernels as se3
 from processing.sensor import view_layout as lay
 from processing.track import kernels as k
 
-COUNTED, BESIDE, BEFORE, SHARED, DEPTH, APPEARANCE_WEIGHT, APPEARANCE_COST = range(7)
+COUNTED, OUTSIDE, BEFORE, SHARED, DEPTH, APPEARANCE_WEIGHT, APPEARANCE_COST = range(7)
 """Columns of a pair's figures: points; sums of what they cost beside the outline and before the surface; weight of the
 points whose surface both see, and their depths' cost; weight of those with an appearance, and their appearance cost."""
 FIGURES = 7
@@ -66,14 +66,14 @@ def consistency_terms(  # noqa: C901 (one hot loop)
             z = pose[2, 0] * p[0] + pose[2, 1] * p[1] + pose[2, 2] * p[2] + pose[2, 3]
             f[COUNTED] += 1.0
             if z < 0.05:
-                f[BESIDE] += 1.0
+                f[OUTSIDE] += 1.0
                 continue
             iz = 1.0 / z
             u = fx * x * iz + cx - u0
             v = fy * y * iz + cy - v0
             iu, iv = int(np.floor(u + 0.5)), int(np.floor(v + 0.5))
             if iu < 1 or iv < 1 or iu >= w - 2 or iv >= h - 2:
-                f[BESIDE] += 1.0
+                f[OUTSIDE] += 1.0
                 continue
             near = off + iv * w + iu
             out = maps[near, lay.OUTSIDE]
@@ -83,7 +83,7 @@ def consistency_terms(  # noqa: C901 (one hot loop)
             if out > 0.0:
                 gap = (max(out - 1.0, 0.0) if rim else out) * z / fx
                 r = gap / s_out
-                f[BESIDE] += min(r * r / 9.0, 1.0)
+                f[OUTSIDE] += min(r * r / 9.0, 1.0)
                 if 0.0 < r < PULLED:
                     du = 0.5 * (max(maps[near + 1, lay.OUTSIDE], 0.0) - max(maps[near - 1, lay.OUTSIDE], 0.0))
                     dv = 0.5 * (max(maps[near + w, lay.OUTSIDE], 0.0) - max(maps[near - w, lay.OUTSIDE], 0.0))

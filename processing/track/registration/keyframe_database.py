@@ -58,7 +58,7 @@ def keyframes_of(
     ground: SupportPlaneConfig,
 ) -> KeyframeDatabase:  # fmt: skip
     """So many keyframes of each toss; after them the drawn views of a learned shape, as if they were one more toss."""
-    chosen = [_spread(t, count) for t, count in zip(tosses, keyframes)]
+    chosen = [_keyframes_from_all_sides(t, count) for t, count in zip(tosses, keyframes)]
     stores = [t.store.only(c) for t, c in zip(tosses, chosen)]
     poses = [t.track.camera_from_object[c] for t, c in zip(tosses, chosen)]
     center_m = tosses[0].center_m
@@ -114,7 +114,7 @@ def far_apart(directions: Float[Array, "n 3"], count: int) -> Int[Array, " m"]:
     return np.sort(np.array(chosen[: len(directions)], dtype=np.int64))
 
 
-def _spread(toss: TossTrack, count: int) -> Int[Array, " m"]:
+def _keyframes_from_all_sides(toss: TossTrack, count: int) -> Int[Array, " m"]:
     """Well fitting keyframes, each as far as possible in direction from those before (the first and last included)."""
     poses = toss.track.camera_from_object
     usable = _usable(toss)

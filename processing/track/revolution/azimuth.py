@@ -167,7 +167,7 @@ def estimate_azimuths(
     if trust < 1.0:
         state = _sought(_near(trust * appearance, shape), rest, [*starts, state], config)
     out = _moved(poses, frames, state * step, axis, first)
-    spread = _spread(frames, _near(trust * appearance, shape), rest, state, len(poses))
+    spread = _azimuth_sigma_rad(frames, _near(trust * appearance, shape), rest, state, len(poses))
     return steady(scene, Azimuths(out, spread, axis, Trust(trust, standing)), use, first, config)
 
 
@@ -181,7 +181,7 @@ def given_azimuths(
     appearance, shape, standing, rest = _weighed(scene, poses, frames, axis, config)
     state = np.zeros(len(frames.views), dtype=np.int64)
     trust = _appearance_weight(appearance, frames.pairs, state, config)
-    spread = _spread(frames, _near(trust * appearance, shape), rest, state, len(poses))
+    spread = _azimuth_sigma_rad(frames, _near(trust * appearance, shape), rest, state, len(poses))
     return Azimuths(poses, spread, axis, Trust(trust, standing))
 
 
@@ -213,12 +213,12 @@ def _sunk(
     return np.minimum(sunk(body, unwrapped.standing, frames.pairs, azimuths_rad, config.steady.roll), config.most_shape)
 
 
-def _spread(
+def _azimuth_sigma_rad(
     frames: _Frames, costs: Float[Array, "m c"], rest: tuple[object, ...], state: Int[Array, " v"], count: int
 ) -> Float[Array, " n"]:
     """Standard deviation (rad) of each frame's azimuth around those found."""
     out = np.zeros(count)
-    for run, s in zip(frames.runs, np.sqrt(tk.spreads(state, costs, *rest))):
+    for run, s in zip(frames.runs, np.sqrt(tk.variances(state, costs, *rest))):
         out[run] = s
     return out
 

@@ -250,7 +250,7 @@ def greedy(v, costs, pairs, base, steps_s, still, spin_weight, expected, slack, 
 
 @no_type_check
 @njit(cache=True, nogil=True, fastmath=True)
-def spreads(state, costs, pairs, base, steps_s, still, spin_weight, expected, slack, step, motion):
+def variances(state, costs, pairs, base, steps_s, still, spin_weight, expected, slack, step, motion):
     """Variance (rad^2) of each view's azimuth against view 0: the widest of the moves that turn it, each with the
     probability that its energy leaves it."""
     v, cells = len(state), costs.shape[1]

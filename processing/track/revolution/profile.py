@@ -49,11 +49,11 @@ class BodyConfig:
     """Where the outline lies farther out (a handle) or in (something covers the body), nothing is compared ..."""
     near_px: float = 6.0
     """... nor so near to such a place."""
-    apart_m: float = 0.004
+    outline_step_m: float = 0.004
     """Points of the outline along the wall."""
     bias_px: float = 0.15
     """Standard deviation of what all masks are too large by, known beforehand ..."""
-    grown_m: float = 0.0005
+    outline_bias_m: float = 0.0005
     """... and of a radius in outlines against one in depth."""
     bend_m: float = 0.0013
     """Usual bend of a profile from node to node, known for each four views."""
@@ -175,7 +175,7 @@ class RoundBody:
         H, g, cross = np.zeros((views, 6, 6)), np.zeros((views, 6)), np.zeros((views, 6, unknowns))
         Hyy, gy = np.zeros((unknowns, unknowns)), np.zeros(unknowns)
         settings = np.array(
-            [c.row_m, self._low_m, c.off_m, c.depth_m, c.outline_px, c.into_px, c.beyond_px, c.near_px, c.apart_m]
+            [c.row_m, self._low_m, c.off_m, c.depth_m, c.outline_px, c.into_px, c.beyond_px, c.near_px, c.outline_step_m]
         )
         rectified, axis, profile = (
             self._store.rectified,
@@ -212,7 +212,7 @@ class RoundBody:
                 weight = views / 4 / c.bend_m**2
                 H[three, three] += weight * np.outer(bend, bend)
                 g[three] += weight * bend * (bend @ self._y[three])
-        for unknown, usual in ((rk.BIAS, c.bias_px), (rk.GROWN, c.grown_m)):
+        for unknown, usual in ((rk.BIAS, c.bias_px), (rk.RADIUS_BIAS, c.outline_bias_m)):
             H[unknown, unknown] += views / usual**2
             g[unknown] += views * self._y[unknown] / usual**2
         H[np.diag_indices(len(g))] += 1e-6 * H.diagonal() + 1.0

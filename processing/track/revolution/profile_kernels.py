@@ -16,9 +16,9 @@ from numba import njit
 from processing.sensor.view_layout import HEIGHT, OFFSET, PX, PY, PZ, SNX, SNY, SNZ, U0, V0, WIDTH
 
 OUTSIDE, INSIDE, TOP, FOOT = range(4)
-LOW, HIGH, BIAS, GROWN = range(-4, 0)
+LOW, HIGH, BIAS, RADIUS_BIAS = range(-4, 0)
 """Places, from the end, of the unknowns that are no nodes."""
-ROW, FIRST_HEIGHT, OFF_M, SIGMA_M, SIGMA_PX, INTO_PX, BEYOND_PX, NEAR_PX, APART_PX = range(9)
+ROW, FIRST_HEIGHT, OFF_M, SIGMA_M, SIGMA_PX, INTO_PX, BEYOND_PX, NEAR_PX, OUTLINE_STEP_PX = range(9)
 """Settings: spacing of nodes, height of the first; residuals beyond OFF_M belong to something else; standard deviations
 of depth and outlines; outlines farther inside or beyond are something else's, and so is what lies NEAR_PX beside them;
 spacing of an outline's points along the wall."""
@@ -124,7 +124,7 @@ def surface_terms(samples, pose, axes, point, y, seen, sizes, config, scale, wei
 def outline_points(pose, axes, point, y, seen, sizes, config, out):
     """Where the camera sees the body's surface end: rows of `out` are height, radius, angle, first node of the radius,
     share of the second, kind (0 the wall, 1 the low end, 2 the high end). Returns how many."""
-    row, low, high, grown = config[ROW], y[LOW], y[HIGH], y[GROWN]
+    row, low, high, radius_bias = config[ROW], y[LOW], y[HIGH], y[RADIUS_BIAS]
     c = np.empty(3)
     for a in range(3):
         c[a] = -(pose[0, a] * pose[0, 3] + pose[1, a] * pose[1, 3] + pose[2, a] * pose[2, 3]) - point[a]
@@ -135,11 +135,11 @@ def outline_points(pose, axes, point, y, seen, sizes, config, out):
         ch += axes[2, a] * c[a]
     off_axis, towards = max(np.sqrt(cx * cx + cy * cy), 1e-6), np.arctan2(cy, cx)
     n = 0
-    steps = max(int((high - low) / config[APART_PX]), 2)
+    steps = max(int((high - low) / config[OUTLINE_STEP_PX]), 2)
     for s in range(steps):
         h = low + (s + 0.5) * (high - low) / steps
         r, slope, j, t, known = _curve(y, seen, sizes, OUTSIDE, (h - config[FIRST_HEIGHT]) / row)
-        r += grown
+        r += radius_bias
         # a normal across the ray: cos(angle) = (r - r' (h - h_camera)) / distance of the camera from the axis
         cosine = (r - min(max(slope / row, -1.0), 1.0) * (h - ch)) / off_axis
         if not known or abs(cosine) >= 1.0:
@@ -151,7 +151,7 @@ def outline_points(pose, axes, point, y, seen, sizes, config, out):
     for end in range(2):
         h, sign = (low, -1.0) if end == 0 else (high, 1.0)
         r, slope, j, t, known = _curve(y, seen, sizes, OUTSIDE, (h - sign * INSET_M - config[FIRST_HEIGHT]) / row)
-        r += grown
+        r += radius_bias
         cap = sign * (ch - h) > 0.0
         for s in range(RING):
             angle = 2.0 * np.pi * s / RING
@@ -214,7 +214,7 @@ def outline_terms(
 ):
     """Adds one view's outline. distance_px: how far all views' pixels lie from the mask's rim (negative inside; far
     where it may be covered). Returns how many points count, of how many, and their squared residuals' sum (px^2)."""
-    found = np.empty((2 * max(int((y[HIGH] - y[LOW]) / config[APART_PX]), 2) + 2 * RING, 6))
+    found = np.empty((2 * max(int((y[HIGH] - y[LOW]) / config[OUTLINE_STEP_PX]), 2) + 2 * RING, 6))
     n = outline_points(pose, axes, point, y, seen, sizes, config, found)
     rim, usable = np.zeros((n, 5)), np.zeros(n, np.bool_)
     P, rad, X, J = np.empty(3), np.empty(3), np.empty(3), np.empty(6)
@@ -242,7 +242,7 @@ def outline_terms(
         J[5] = P[0] * J[1] - P[1] * J[0]
         k = weight / (1.0 + (e / (2.0 * config[SIGMA_PX])) ** 2) / config[SIGMA_PX] ** 2
         j, t, kind = int(found[s, 3]), found[s, 4], int(found[s, 5])
-        places = (j, j + 1, ny + BIAS, ny + GROWN, ny + LOW if kind == 1 else ny + HIGH)
+        places = (j, j + 1, ny + BIAS, ny + RADIUS_BIAS, ny + LOW if kind == 1 else ny + HIGH)
         parts = (by_radius * (1.0 - t), by_radius * t, -1.0, by_radius, by_height if kind > 0 else 0.0)
         for a in range(6):
             ja = k * J[a]

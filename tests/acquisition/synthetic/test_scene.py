@@ -55,9 +55,9 @@ def test_depth_is_later_than_colour_by_what_was_set(short):
 
 
 def test_brightness_drifts_by_the_share_that_was_set(short):
-    course = brightness_over_time(short, 0, np.linspace(0, 1.5, 45))
-    assert np.abs(course - 1).max() == pytest.approx(0.4)
-    assert np.abs(np.diff(course)).max() < 0.2
+    brightness = brightness_over_time(short, 0, np.linspace(0, 1.5, 45))
+    assert np.abs(brightness - 1).max() == pytest.approx(0.4)
+    assert np.abs(np.diff(brightness)).max() < 0.2
 
 
 def test_calibration_errors_have_the_size_that_was_set(short):
@@ -71,12 +71,12 @@ def test_calibration_errors_have_the_size_that_was_set(short):
     assert np.rad2deg(np.arccos(plane.rotation[2, 2])) == pytest.approx(0.3, rel=1e-3)
 
 
-def test_session_json_has_the_believed_pose_and_truth_the_real_one(written, short):
+def test_session_json_has_the_calibrated_pose_and_truth_the_real_one(written, short):
     out, truth = written
-    believed = np.array(json.loads((out / "session.json").read_text())["T_world_camera"])
+    calibrated = np.array(json.loads((out / "session.json").read_text())["T_world_camera"])
     real = np.array(json.loads((truth / "calibration.json").read_text())["T_world_d455"])
     np.testing.assert_allclose(real, Lab(short).world_from_d455.matrix)
-    assert 1e-4 < np.abs(believed - real).max() < 0.01
+    assert 1e-4 < np.abs(calibrated - real).max() < 0.01
 
 
 def test_truth_agrees_with_itself(written):

@@ -144,7 +144,7 @@ def test_a_plane_is_blamed_first_only_where_every_toss_says_the_same():
 
 def test_own_tracks_are_never_asked_to_be_imported_in_another_reading(real_tosses):
     tracks = [replace(t, rotation=np.swapaxes(t.rotation, 1, 2).copy()) for t in real_tosses(range(8))]
-    with pytest.raises(checks.Contradiction, match="import the data again") as refused:
+    with pytest.raises(checks.InconsistentPoses, match="import the data again") as refused:
         checks.check_orientations(tracks, np.eye(3))
     assert "import" not in refused.value.of_own_tracks
     assert refused.value.of_own_tracks.index("its orientation is off") < refused.value.of_own_tracks.index("the table")

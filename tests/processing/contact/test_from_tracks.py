@@ -7,7 +7,7 @@ import trimesh
 
 from processing.contact.fuse import Field, FusionConfig, Readings, Sizes, Surface, likely_sizes
 from processing.contact.learn.convexity import choose_geometry, measured_prior
-from processing.contact.learn.data_checks import Contradiction
+from processing.contact.learn.data_checks import InconsistentPoses
 from processing.contact.learn.fit import FitConfig
 from processing.contact.learn.from_tracks import TracksConfig, learn_from_tracks
 from processing.contact.learn.learn import ContactConfig
@@ -132,7 +132,7 @@ def test_other_object_frames_and_cameras_are_refused(simulated_tosses):
 
 def test_tracks_whose_impacts_fit_another_reading_are_said_to_be_off(simulated_tosses, monkeypatch):
     def refused(*_):
-        raise Contradiction("import the data again", "most likely its orientation is off")
+        raise InconsistentPoses("import the data again", "most likely its orientation is off")
 
     monkeypatch.setattr("processing.contact.learn.data_checks.check_orientations", refused)
     with pytest.raises(BadInput, match="most likely its orientation is off") as wrong:

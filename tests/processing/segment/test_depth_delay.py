@@ -25,8 +25,9 @@ from processing.segment.background.static_scene import StaticScene
 from processing.sensor.depth_stamps import with_depth_later
 from processing.sensor.still import StillSettings, ThinnedSession, kept_of
 from processing.stages.find import find_object
-from processing.stages.rig import refine_rig, with_depth_in_time
-from processing.stages.scene import learn_static_scene
+from processing.stages.recording.depth_delay import with_depth_in_time
+from processing.stages.recording.rig import refine_rig
+from processing.stages.recording.scene import learn_static_scene
 from processing.stages.segment import segment
 from processing.start import start_run
 from recordings.geometry import Transform, rotation_exp, rotation_log

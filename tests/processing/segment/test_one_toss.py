@@ -23,8 +23,8 @@ from processing.segment.background.static_scene import (
     seen_table_depth,
 )
 from processing.stages.find import find_object
-from processing.stages.rig import refine_rig
-from processing.stages.scene import learn_static_scene, scene_notes
+from processing.stages.recording.rig import refine_rig
+from processing.stages.recording.scene import learn_static_scene, scene_notes
 from processing.stages.segment import segment
 from processing.start import start_run
 from recordings.errors import DamagedFile

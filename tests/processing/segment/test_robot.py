@@ -27,8 +27,8 @@ from processing.segment.robot.of_session import Rig, RobotOfSession
 from processing.segment.robot.render import RobotView
 from processing.sensor.frames import corrected_depth, metric_frames
 from processing.stages.find import find_object
-from processing.stages.rig import refine_rig
-from processing.stages.scene import learn_static_scene
+from processing.stages.recording.rig import refine_rig
+from processing.stages.recording.scene import learn_static_scene
 from processing.stages.segment import segment
 from processing.start import start_run
 from recordings.geometry import CameraModel, Transform, rotation_exp, rotation_log

@@ -131,7 +131,7 @@ def test_azimuths_that_pairs_of_views_agree_on_are_found_from_nothing(seed: int)
     state = state - state[0]
     assert np.abs((state - steady + count // 2) % count - count // 2).max() <= 1
     blind = given(np.zeros_like(costs), pairs, views)
-    assert tk.spreads(state, *problem).max() < 0.1 * tk.spreads(state, *blind).max()
+    assert tk.variances(state, *problem).max() < 0.1 * tk.variances(state, *blind).max()
 
 
 def test_a_stretch_that_shows_nothing_turns_as_steadily_as_what_is_seen_around_it() -> None:

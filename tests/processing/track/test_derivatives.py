@@ -216,7 +216,7 @@ def profile(radius_m=0.04, slope=0.2):
     y[rk.LOW], y[rk.HIGH] = -0.05, 0.05
     config = np.zeros(9)
     config[[rk.ROW, rk.FIRST_HEIGHT, rk.OFF_M, rk.SIGMA_M]] = PROFILE["row_m"], PROFILE["first_m"], 0.012, 0.0015
-    config[[rk.SIGMA_PX, rk.INTO_PX, rk.BEYOND_PX, rk.NEAR_PX, rk.APART_PX]] = 0.7, 6.0, 6.0, 3.0, 0.01
+    config[[rk.SIGMA_PX, rk.INTO_PX, rk.BEYOND_PX, rk.NEAR_PX, rk.OUTLINE_STEP_PX]] = 0.7, 6.0, 6.0, 3.0, 0.01
     return y, config
 
 

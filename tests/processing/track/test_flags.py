@@ -83,9 +83,9 @@ def views_of_a_card(quarter_turns: list[int]) -> ViewStore:
     return store
 
 
-def in_doubt(shown: list[int], believed: list[int], near: list[int]) -> list[int]:
+def uncertain(shown: list[int], followed: list[int], near: list[int]) -> list[int]:
     poses = np.tile(np.eye(4), (len(shown), 1, 1))
-    for pose, quarters in zip(poses, believed):
+    for pose, quarters in zip(poses, followed):
         pose[:3, :3] = rotation_exp(np.array([0, 0, quarters * np.pi / 2]))
     pairs = np.array([(0, i) for i in near], dtype=np.int64)
     use = np.ones(len(shown), dtype=bool)
@@ -94,15 +94,15 @@ def in_doubt(shown: list[int], believed: list[int], near: list[int]) -> list[int
     return np.flatnonzero(found).tolist()
 
 
-def test_outlines_that_contradict_the_first_one_for_long_put_the_way_there_in_doubt_too() -> None:
+def test_outlines_that_contradict_the_first_one_for_long_make_the_way_there_uncertain_too() -> None:
     shown = [0, 0, 0, 0, 1, 1, 1, 1]
-    assert in_doubt(shown, [0] * 8, near=[1]) == [2, 3, 4, 5, 6, 7]
-    assert in_doubt(shown, [0] * 8, near=[1, 2, 3]) == [4, 5, 6, 7]
+    assert uncertain(shown, [0] * 8, near=[1]) == [2, 3, 4, 5, 6, 7]
+    assert uncertain(shown, [0] * 8, near=[1, 2, 3]) == [4, 5, 6, 7]
 
 
 def test_outlines_of_a_body_that_turned_as_its_poses_say_contradict_nothing() -> None:
-    assert in_doubt([0, 0, 0, 0, 1, 1, 1, 1], [0, 0, 0, 0, 1, 1, 1, 1], near=[1]) == []
+    assert uncertain([0, 0, 0, 0, 1, 1, 1, 1], [0, 0, 0, 0, 1, 1, 1, 1], near=[1]) == []
 
 
 def test_a_wrong_mask_of_a_frame_or_two_contradicts_no_pose() -> None:
-    assert in_doubt([0, 0, 0, 1, 1, 0, 0, 0], [0] * 8, near=[1]) == []
+    assert uncertain([0, 0, 0, 1, 1, 0, 0, 0], [0] * 8, near=[1]) == []

@@ -213,7 +213,7 @@ def check_published(session: Path, count: int, duplicates: int) -> None:
 
 
 def test_some_published_tosses_are_what_their_page_says(data, tmp_path):
-    """Two pairs of one recording (README of the data, section 2) among ten files; gravity and spins fit."""
+    """Two pairs of one recording among ten files; gravity and spins fit."""
     source = data("contactnets")
     shutil.copytree(source / "params_processed", tmp_path / "cn" / "params_processed")
     (tmp_path / "cn" / "tosses_processed").mkdir()

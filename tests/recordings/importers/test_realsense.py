@@ -172,7 +172,7 @@ def test_several_recordings_of_one_camera_are_several_tosses(record: Record, tmp
 
 
 def test_the_real_recording_comes_in_whole_and_its_pair_is_not_called_one(data, tmp_path):
-    """Colour and depth 170 are 268 ms apart (README of the data, section 8); the other depth frame is 169."""
+    """Colour and depth 170 are 268 ms apart; the other depth frame is 169."""
     import_realsense([data(REAL_BAG)], tmp_path / "session")
     session = Session.open(tmp_path / "session")
     toss = session.toss(0)

@@ -215,7 +215,7 @@ def test_the_session_says_a_hand_eye_that_is_off_by_what_the_spec_says():
     off = built.world_from_camera.inverse() @ place
     assert np.linalg.norm(off.translation_m) == pytest.approx(drawn.wrong.camera_m, rel=1e-6)
     assert camera.fx / built.camera.fx == pytest.approx(1 + drawn.wrong.focal_share)
-    base = session.believed_base(drawn, built)
+    base = session.calibrated_base(drawn, built)
     wrong = built.arm.world_from_base.inverse() @ base
     assert np.linalg.norm(wrong.translation_m) == pytest.approx(drawn.wrong.hand_eye_m, rel=1e-6)
     assert np.degrees(rotation_angle_rad(wrong.rotation)) == pytest.approx(drawn.wrong.hand_eye_deg, rel=1e-4)

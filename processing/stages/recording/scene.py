@@ -1,4 +1,4 @@
-"""Stages `scene`: what the camera sees without the object; and `noise`: how its depth errs on the table there."""
+"""Stage `scene`: what the camera sees without the object."""
 
 from __future__ import annotations
 
@@ -8,21 +8,17 @@ from pathlib import Path
 
 import numpy as np
 
-from processing.run import CAMERA, Run, toss_keys
+from processing.run import CAMERA, Run
 from processing.scene_frames import background_keys, hidden_by_robot, read, scene_frames
 from processing.segment.background.static_scene import (
-    StaticScene,
     calibrated_table_depth,
     learn_scene,
     seen_table_depth,
 )
-from processing.sensor.noise import PUBLISHED, DepthNoise, measured_noise
 from processing.store import Done
 from recordings.records import RgbdFrame
 
 VERSION = 7
-NOISE_VERSION = 1
-NOISE_FRAMES = 3
 
 
 @dataclass(frozen=True)
@@ -75,37 +71,3 @@ def _learn(run: Run, folder: Path) -> SceneResult:
         known_share=round(float(scene.known.mean()), 4),
         robot_left_out=hidden is not None,
     )
-
-
-@dataclass(frozen=True)
-class NoiseResult:
-    """Frames whose table was large enough, and the medians over them (published figures where there is none): standard
-    deviation of depth at 1 m (m), pixels that err as one."""
-
-    frames: int
-    sigma_at_1m: float
-    patch_px: float
-
-    @property
-    def noise(self) -> DepthNoise:
-        """As the estimators use it."""
-        return DepthNoise(self.sigma_at_1m, self.patch_px)
-
-
-def measure_noise(run: Run, scene: Done) -> Done[NoiseResult]:
-    """On frames spread over the first toss. Without a calibrated table what the scene shows there is taken for it:
-    then planes only are measured."""
-    toss = run.recorded[0]
-
-    def compute(_: Path) -> NoiseResult:
-        frames = run.session.toss(toss).rgbd(CAMERA)
-        background = StaticScene.read(scene.folder)
-        rays = run.camera.pixel_rays()
-        rays = rays / np.maximum(rays[..., 2:], 1e-9)
-        chosen = np.unique(np.linspace(0, len(frames) - 1, NOISE_FRAMES).astype(int))
-        found = [measured_noise(frames[int(i)].depth_m, background.table_depth_m, rays) for i in chosen]
-        measured = [n for n in found if n is not None] or [PUBLISHED]
-        sigma, patch = (float(np.median([getattr(n, name) for n in measured])) for name in ("sigma_at_1m", "patch_px"))
-        return NoiseResult(sum(n is not None for n in found), sigma, patch)
-
-    return run.store.run("noise", NOISE_VERSION, {}, {"scene": scene.key, **toss_keys(run, toss)}, NoiseResult, compute)

@@ -1,4 +1,4 @@
-"""Stage `track` by the baseline: point-to-plane ICP to a TSDF; its folder holds its shape too."""
+"""Stage `track-to-model`, the baseline: point-to-plane ICP to a TSDF; its folder holds its shape too."""
 
 from __future__ import annotations
 
@@ -27,4 +27,4 @@ def track_to_model(run: Run, images: Images) -> Done[TrackResult]:
         return TrackResult(len(status), status.count("interpolated"), int(tracked.track.lost.sum()))
 
     config = {"tracker": run.tracker, **vars(run.config.frame_to_model)}
-    return run.store.run("track", VERSION, config, images.inputs, TrackResult, compute)
+    return run.store.run("track-to-model", VERSION, config, images.inputs, TrackResult, compute)
