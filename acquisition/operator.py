@@ -143,7 +143,7 @@ class Keyboard(Nobody):
 
     def line(self, question: str) -> str:
         self.say(question)
-        with _lines(sys.stdin):
+        with single_keys(sys.stdin, lines=True):
             while "\n" not in self._typed and not self._closed:
                 self._listen(POLL_S)
         line, _, self._typed = self._typed.partition("\n")
@@ -158,35 +158,22 @@ class Keyboard(Nobody):
 
 
 @contextlib.contextmanager
-def single_keys(stream: TextIO) -> Iterator[None]:
-    """Keys come without Enter while this is open; the terminal is left as it was."""
+def single_keys(stream: TextIO, lines: bool = False) -> Iterator[None]:
+    """Keys come without Enter (or with `lines`, the other way round) while this is open; the terminal is left as it
+    was."""
     if not stream.isatty():
         yield
         return
     import termios
     import tty
 
-    before = termios.tcgetattr(stream.fileno())
-    try:
-        tty.setcbreak(stream.fileno())
-        yield
-    finally:
-        termios.tcsetattr(stream.fileno(), termios.TCSADRAIN, before)
-
-
-@contextlib.contextmanager
-def _lines(stream: TextIO) -> Iterator[None]:
-    """The other way round: a line with Enter."""
-    if not stream.isatty():
-        yield
-        return
-    import termios
-
-    before = termios.tcgetattr(stream.fileno())
-    cooked = termios.tcgetattr(stream.fileno())
+    before, cooked = (termios.tcgetattr(stream.fileno()) for _ in range(2))
     cooked[3] |= termios.ICANON | termios.ECHO
     try:
-        termios.tcsetattr(stream.fileno(), termios.TCSADRAIN, cooked)
+        if lines:
+            termios.tcsetattr(stream.fileno(), termios.TCSADRAIN, cooked)
+        else:
+            tty.setcbreak(stream.fileno())
         yield
     finally:
         termios.tcsetattr(stream.fileno(), termios.TCSADRAIN, before)

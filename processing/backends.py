@@ -13,8 +13,9 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from processing.published_weights import PUBLISHED, find_weights, fingerprint
+from processing.published_weights import PUBLISHED, find_weights
 from recordings.errors import BadInput
+from recordings.whole_file import file_sha256
 
 if TYPE_CHECKING:
     from processing.features.sift import FeatureMatcher
@@ -74,7 +75,7 @@ def settings_of(name: str, backends: Backends) -> dict[str, str]:
     """What a stage's settings must say of a backend: nothing of a default, else its name and its weights' sha256."""
     if name not in PUBLISHED:
         return {}
-    return {"backend": name, "weights_sha256": fingerprint(find_weights(PUBLISHED[name], backends.weights))}
+    return {"backend": name, "weights_sha256": file_sha256(find_weights(PUBLISHED[name], backends.weights))}
 
 
 def make_segmenter(backends: Backends, background: Segmenter, device: str = "cpu") -> Segmenter:

@@ -5,7 +5,6 @@ Nothing is ever downloaded. A file is read as tensors alone (`weights_only`); ea
 
 from __future__ import annotations
 
-import hashlib
 import pickletools
 import zipfile
 from collections.abc import Mapping
@@ -130,9 +129,3 @@ def check_layers(found: Mapping[str, Tensor], wanted: Shapes, path: Path, file: 
     if wrong:
         more = f" and {len(wrong) - 3} more" if len(wrong) > 3 else ""
         raise BadInput(f"{path} holds other layers: {'; '.join(wrong[:3])}{more}; wanted: {file}")
-
-
-def fingerprint(path: Path) -> str:
-    """sha256 of a file, for the keys of stages that depend on it."""
-    with open(path, "rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

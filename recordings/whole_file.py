@@ -40,6 +40,14 @@ def file_sha256(path: Path) -> str:
         return hashlib.file_digest(data, "sha256").hexdigest()
 
 
+def changed_ns(path: Path) -> int | None:
+    """When the file was last written; None where it is not there."""
+    try:
+        return path.stat().st_mtime_ns
+    except OSError:
+        return None
+
+
 def without_nan(value: Any) -> Any:
     """A JSON value as strict JSON has it: null where a number is NaN or infinite, lists for tuples."""
     if isinstance(value, Mapping):

@@ -1,5 +1,6 @@
 """What holds for the house as a whole: quick and light --help, pinned packages, laws that no tool knows."""
 
+import ast
 import importlib.util
 import json
 import re
@@ -137,6 +138,12 @@ def test_long_files_and_long_functions_need_a_reason_of_their_own(check):
     long_function = "def f():\n" + "    x = 1\n" * 80
     assert len(list(check.too_long("a.py", long_function + "# long because: not in the function\n"))) == 1
     assert not list(check.too_long("a.py", long_function + "    # long because: one compiled loop\n    x = 2\n"))
+
+
+def test_a_stage_is_found_by_its_call_of_the_store(check):
+    call = ast.parse("run.store.run('fuse', VERSION, config, inputs, FuseResult, compute)", mode="eval").body
+    assert check.stage_made(call) == "fuse"
+    assert check.stage_made(ast.parse("subprocess.run('fuse')", mode="eval").body) is None
 
 
 def test_no_paragraph_of_the_architecture_is_longer_than_120_words_and_every_file_it_names_is_there():

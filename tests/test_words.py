@@ -9,6 +9,9 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("acquisition", "calibration", "groundtruth", "processing", "recordings")
 REPLACED = {
     "sighting": "detection",
+    "evidence": "appearance likelihood ratio, residual",
+    "opposed": "free-space and silhouette consistency",
+    "contradiction": "free-space and silhouette consistency, inconsistent poses",
     "footing": "support plane",
     "badness": "severity, cost",
     "witness": "refinement by the D455's own tags",
@@ -27,6 +30,7 @@ REPLACED = {
     "price": "cost",
     "grow": "extend (a tree), incremental initialisation",
 }
+FILE = re.compile(r"\w+\.(json|npz|npy|ply)")
 ALLOWED = {
     "MIDDLE_GREY": "a word of photography",
     "beside_px": "a setting, and settings are in the keys of stored stages",
@@ -42,22 +46,32 @@ def words(name: str) -> set[str]:
 
 
 def names(tree: ast.Module) -> Iterator[tuple[int, str]]:
-    """What others see of a module: functions, their parameters, classes, their fields, constants."""
+    """What others see of a module: functions, their parameters, classes, their fields, constants, keys of documents."""
     for node in ast.walk(tree):
         if isinstance(node, ast.FunctionDef | ast.ClassDef):
             yield node.lineno, node.name
         if isinstance(node, ast.arg):
             yield node.lineno, node.arg
+        if isinstance(node, ast.Dict):
+            yield from ((k.lineno, k.value) for k in node.keys if isinstance(k, ast.Constant) and is_word(k.value))
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and FILE.fullmatch(node.value):
+            yield node.lineno, node.value
         if isinstance(node, ast.Module | ast.ClassDef):
             targets = [t for s in node.body if isinstance(s, ast.Assign | ast.AnnAssign) for t in targets_of(s)]
             yield from ((t.lineno, t.id) for t in targets if isinstance(t, ast.Name))
 
 
+def is_word(value: object) -> bool:
+    return isinstance(value, str) and value.isidentifier()
+
+
 def targets_of(statement: ast.Assign | ast.AnnAssign) -> list[ast.expr]:
-    return statement.targets if isinstance(statement, ast.Assign) else [statement.target]
+    """The names that it gives a value, one by one."""
+    targets = statement.targets if isinstance(statement, ast.Assign) else [statement.target]
+    return [name for t in targets for name in (t.elts if isinstance(t, ast.Tuple) else [t])]
 
 
-def test_functions_parameters_classes_fields_and_constants_are_named_by_the_words_of_the_field():
+def test_functions_parameters_classes_fields_constants_and_keys_are_named_by_the_words_of_the_field():
     found = []
     for path in (p for package in PACKAGES for p in (ROOT / package).rglob("*.py")):
         for line, name in names(ast.parse(path.read_text())):

@@ -1,7 +1,7 @@
 """Checks all that `make check` promises: style, types, the house's walls, the size of files, no names of machines.
 
 python tools/check.py           # all
-python tools/check.py walls     # one of: style format types walls circles house
+python tools/check.py walls     # one of: style format types walls circles stages house
 """
 
 from __future__ import annotations
@@ -117,6 +117,44 @@ def circles() -> Iterator[str]:
         yield f"an import circle: {' -> '.join(reversed(circle.args[1]))}"
 
 
+def stages() -> Iterator[str]:
+    """A stage is one verb in one file of processing/stages/ (`floor`, which knows the truth, in evaluate/) with one
+    VERSION; the file bears its name; and no stage calls another one: the order is the pipeline's."""
+    folder, files = ROOT / "processing" / "stages", [p for p in modules() if "processing" in p.parts]
+    verbs: dict[str, set[str]] = {}
+    for path in files:
+        place, tree = path.relative_to(ROOT).as_posix(), ast.parse(path.read_text())
+        made = [name for node in ast.walk(tree) if (name := stage_made(node)) is not None]
+        if folder not in path.parents and not made:
+            continue
+        if path.name == "__init__.py":
+            continue
+        if folder not in path.parents and place != "processing/evaluate/floor.py":
+            yield f"{place}: makes the stage {made[0]!r}; stages stand in processing/stages/"
+        if made != [path.stem.replace("_", "-")]:
+            yield f"{place}: makes the stages {made}, wanted one, of the file's name"
+        versions = [t.id for s in tree.body if isinstance(s, ast.Assign) for t in s.targets
+                    if isinstance(t, ast.Name) and "VERSION" in t.id]  # fmt: skip
+        if versions != ["VERSION"]:
+            yield f"{place}: has the versions {versions}, wanted one, VERSION"
+        verbs[".".join(path.relative_to(ROOT).with_suffix("").parts)] = {
+            n.name for n in tree.body if isinstance(n, ast.FunctionDef) and any(stage_made(x) for x in ast.walk(n))
+        }
+    for path in (p for p in files if folder in p.parents):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ImportFrom):
+                for name in sorted({a.name for a in node.names} & verbs.get(node.module or "", set())):
+                    yield f"{path.relative_to(ROOT)}:{node.lineno}: calls the stage of {node.module}: {name}"
+
+
+def stage_made(node: ast.AST) -> str | None:
+    """The name of the stage that is made by this call of `Store.run`; None for every other node."""
+    if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr == "run":
+        first = node.args[0] if len(node.args) == 6 else None
+        return first.value if isinstance(first, ast.Constant) and isinstance(first.value, str) else None
+    return None
+
+
 def hidden_machines(name: str, text: str) -> Iterator[str]:
     for number, line in enumerate(text.splitlines(), 1):
         for pattern, what in ((MACHINE_PATH, "a path of one machine"), (HOSTS, "a package registry's host")):
@@ -142,6 +180,7 @@ CHECKS: dict[str, Callable[[], Iterator[str]]] = {
     "types": tool("mypy", "--no-error-summary"),
     "walls": tool("lint-imports", "--no-cache", "--no-logo"),
     "circles": circles,
+    "stages": stages,
     "house": house,
 }
 

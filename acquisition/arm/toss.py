@@ -136,7 +136,8 @@ def plan_toss(model: ArmModel, space: Space, target: TossTarget, delay: ReleaseD
     )
     best: Breach | Contact | None = None
     for q, dq in _releases(model, base_from_tool, twist):
-        breach: Breach | Contact | None = _speed_breach(model, dq)
+        speed = np.abs(dq)[None]
+        breach: Breach | Contact | None = _breach(model, "velocity", "rad/s", np.zeros(1), speed, model.velocity)
         run_ups_s = RUN_UPS_S if breach is None else ()
         for run_up_s in run_ups_s:
             plan, wrong = _attempt(model, q, dq, run_up_s, delay, space)
@@ -306,10 +307,6 @@ def _joined(up: Samples, dq: Float[Array, " j"], window_s: float, down: Samples)
     past = t >= second_s + float(down.time_s[-1])
     q[past], v[past], a[past] = down.q[-1], still, still
     return Samples(t, q, v, a)
-
-
-def _speed_breach(model: ArmModel, dq: Float[Array, " j"]) -> Breach | None:
-    return _breach(model, "velocity", "rad/s", np.zeros(1), np.abs(dq)[None], model.velocity)
 
 
 def _breach(

@@ -243,7 +243,7 @@ class FciServer(Faulty):
             self.body.extrapolate()
             return None
         position = motion.generator == wire.Generator.JOINT_POSITION
-        error = self.body.follow(command["q_c"]) if position else self.body.follow_speed(command["dq_c"])
+        error = self.body.follow(command["q_c"] if position else self.body.q_d + command["dq_c"] * TICK_S)
         if error is None and command["finished"]:
             if self.body.resting:
                 return self._end(wire.Answer.SUCCESS, reply=False)

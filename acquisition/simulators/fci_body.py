@@ -42,9 +42,6 @@ class FciBody:
         self._measure()
         return error
 
-    def follow_speed(self, dq_c: Float[Array, "7"]) -> str | None:
-        return self.follow(self.q_d + dq_c * TICK_S)
-
     def extrapolate(self) -> None:
         """No command came in time: the arm goes on with the last acceleration, as the real one does."""
         self.dq_d = self.dq_d + self.ddq_d * TICK_S

@@ -123,7 +123,8 @@ class ClockMapper:
         assert self._last is not None
         passed_device, passed_host = device_ns - self._last[0], host_ns - self._last[1]
         frames = number - self._last[2]
-        jump_ns = passed_device - (frames * self._period() if self._periods and frames > 0 else passed_host)
+        expected = frames * float(np.median(self._periods)) if self._periods and frames > 0 else passed_host
+        jump_ns = passed_device - expected
         unexplained_ns = passed_device - passed_host
         if abs(unexplained_ns) > LARGE_STEP_NS and abs(jump_ns) > LARGE_STEP_NS:
             self._step(host_ns, round(jump_ns))
@@ -154,9 +155,6 @@ class ClockMapper:
         self._points.clear()
         self._periods.clear()
         self._pending, self._line, self._count = None, None, 0
-
-    def _period(self) -> float:
-        return float(np.median(self._periods))
 
     def _keep(self, device_ns: int, host_ns: int) -> None:
         latency_ns = host_ns - device_ns

@@ -7,7 +7,7 @@ so at the release they move as planned; all speeds stay below 0.9 of the URDF's 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -99,7 +99,7 @@ class Arm:
         """All links at an instant."""
         links = self.robot.links(swing.q_rad(time_s), swing.finger_width_m(time_s))
         return [
-            Placed(body, _as_body(self.world_from_base @ links[link] @ link_from_mesh))
+            Placed(body, replace(self.world_from_base @ links[link] @ link_from_mesh, source="body"))
             for link, link_from_mesh, body in self.bodies
         ]
 
@@ -240,10 +240,6 @@ def _smooth(share: float) -> float:
     """0 to 1 with zero speed and acceleration at both ends."""
     x = float(np.clip(share, 0, 1))
     return x**3 * (10 - 15 * x + 6 * x * x)
-
-
-def _as_body(world_from_mesh: Transform) -> Transform:
-    return Transform("world", "body", world_from_mesh.rotation, world_from_mesh.translation_m)
 
 
 def _painted(mesh: ColoredMesh) -> PaintedMesh:

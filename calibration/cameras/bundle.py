@@ -176,7 +176,7 @@ def _finished(
     named = next((name for name, where in blocks.items() if where.start <= worst < where.stop), ("none", -1))
     return Solved(
         scene,
-        _slips(scene, seen) - _unwhitened(residual, seen),
+        _slips(scene, seen) - np.linalg.solve(seen.whitening, residual[..., None])[..., 0],
         weight,
         inverse * max(scale, 1.0) ** 2,
         blocks,
@@ -195,10 +195,6 @@ def _scores(
     values = -(weight[:, None] * residual).ravel()
     by_view = sparse.csr_matrix((values, (rows, np.repeat(view, 2))), shape=(len(rows), len(views)))
     return (jacobian.T @ by_view).toarray()
-
-
-def _unwhitened(residual: Float[Array, "n 2"], seen: Observations) -> Float[Array, "n 2"]:
-    return np.linalg.solve(seen.whitening, residual[..., None])[..., 0]
 
 
 def _blocks(scene: Scene) -> tuple[dict[tuple[str, int], slice], int]:

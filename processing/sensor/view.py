@@ -347,6 +347,16 @@ class ViewStore:
         change = np.median(np.abs(a[1] - b[1])[a[0] & b[0]])
         return bool(move_px < STILL_PX and change < STILL_BRIGHTNESS)
 
+    def still_runs(self, use: Bool[Array, " n"]) -> list[list[int]]:
+        """The used frames, those between which the object stands still together."""
+        runs: list[list[int]] = []
+        for i in np.flatnonzero(use).tolist():
+            if runs and runs[-1][-1] == i - 1 and self.stands_still(i - 1, i):
+                runs[-1].append(i)
+            else:
+                runs.append([i])
+        return runs
+
     def only(self, views: Int64[Array, " m"]) -> ViewStore:
         """The same store with some of its views alone (pixels copied)."""
         out = ViewStore(self.rectified, [self.crops[int(i)] for i in views], self.config)

@@ -66,7 +66,7 @@ def log_likelihood_ratio(
     """Log likelihood ratio (nats) of the appearance under hypothesis `one` against `other`; positive speaks for
     `one`."""
     use = use & np.isfinite(one[:, 0, 0]) & np.isfinite(other[:, 0, 0])
-    views = _views(scene, use)
+    views = np.array([run[len(run) // 2] for run in scene.store.still_runs(use)], dtype=np.int64)
     apart = turns_apart_deg(one[views], other[views])
     disputed = apart > config.disputed_deg
     if not disputed.any():
@@ -105,17 +105,6 @@ class _Usual:
 
 def _cells(appearance: Float[Array, "p 2"], median: Float[Array, "2"], sigma: Float[Array, "2"], cells: int) -> Array:
     return np.clip(np.round((appearance - median) / sigma) + cells // 2, 0, cells - 1).astype(int)
-
-
-def _views(scene: Scene, use: Bool[Array, " n"]) -> Int[Array, " v"]:
-    """The used views, one for frames between which the object stands still."""
-    runs: list[list[int]] = []
-    for i in np.flatnonzero(use):
-        if runs and runs[-1][-1] == i - 1 and scene.store.stands_still(int(i) - 1, int(i)):
-            runs[-1].append(int(i))
-        else:
-            runs.append([int(i)])
-    return np.array([run[len(run) // 2] for run in runs], dtype=np.int64)
 
 
 def turns_apart_deg(one: Float[Array, "v 4 4"], other: Float[Array, "v 4 4"]) -> Float[Array, "v v"]:

@@ -62,7 +62,8 @@ def import_bundlesdf(
         raise BadInput(f"--fps {fps:g}; wanted the frames per second of the recording, for instance --fps 30")
     tosses = [_list_toss(number, folder, warnings) for number, folder in enumerate(_folders(sources))]
     for toss in tosses[1:]:
-        if not _same_camera(toss.camera, tosses[0].camera):
+        a, b = toss.camera, tosses[0].camera
+        if (a.width, a.height) != (b.width, b.height) or not np.allclose(a.K, b.K, rtol=0, atol=1e-3):
             raise BadInput(
                 f"{toss.folder} has another camera than {tosses[0].folder}; wanted one cam_K and image size per session"
             )
@@ -125,10 +126,6 @@ def _camera_matrix(path: Path) -> Float[Array, "3 3"]:
         raise BadInput(
             f"{path}: {len(words)} words ({wrong}); wanted a 3x3 camera matrix, three numbers a line"
         ) from wrong
-
-
-def _same_camera(a: CameraModel, b: CameraModel) -> bool:
-    return (a.width, a.height) == (b.width, b.height) and np.allclose(a.K, b.K, rtol=0, atol=1e-3)
 
 
 def _frame_numbers(color: Sequence[Path]) -> Int64[Array, " n"]:

@@ -96,8 +96,9 @@ class _Walk:
             offset = self._without_mark()
         while offset < self.file.size and not self.found.whole_ending:
             offset = self._step(offset)
-        if not self.found.whole_ending and not self._ends_in_damage():
-            self.found.damage.append((self.file.size, self.file.size, "the file ends without its index"))
+        damage = self.found.damage
+        if not self.found.whole_ending and not (damage and damage[-1][1] == self.file.size):
+            damage.append((self.file.size, self.file.size, "the file ends without its index"))
         self._definitions()
         self.found.loose_messages = self.messages
         return self.found
@@ -224,9 +225,6 @@ class _Walk:
     def _definitions(self) -> None:
         self.found.schemas = {**self.doubtful[Schema], **self.found.schemas}  # type: ignore[dict-item]
         self.found.channels = {**self.doubtful[Channel], **self.found.channels}  # type: ignore[dict-item]
-
-    def _ends_in_damage(self) -> bool:
-        return bool(self.found.damage) and self.found.damage[-1][1] == self.file.size
 
 
 def _message(body: bytes, compressed: bool) -> SavedMessage:

@@ -7,7 +7,7 @@ import numpy as np
 
 from recordings.film.film import Film
 from recordings.session import Toss
-from recordings.tracks import ObjectTrack, Status
+from recordings.tracks import ObjectTrack
 from recordings.view.scene import Body, Scene, moment_ns, root_poses
 
 CAMERA = "d455"
@@ -40,9 +40,6 @@ def _on_frames(scene: Scene, body: Body | None, toss: int, recorded: Toss) -> Ob
     for i, time_ns in enumerate(nowhere.time_ns):
         k = int(np.abs(times_ns - time_ns).argmin()) if len(times_ns) else 0
         if len(times_ns) and abs(times_ns[k] - time_ns) <= half_ns and np.isfinite(root_from_object[k]).all():
-            poses[i], status[i] = camera_from_root.matrix @ root_from_object[k], _status(body, toss, k)
+            poses[i] = camera_from_root.matrix @ root_from_object[k]
+            status[i] = "interpolated" if body.poses[toss][k].status == "interpolated" else "tracked"
     return ObjectTrack(toss, CAMERA, "object", nowhere.time_ns, poses, tuple(status), nowhere.covariance)
-
-
-def _status(body: Body, toss: int, k: int) -> Status:
-    return "interpolated" if body.poses[toss][k].status == "interpolated" else "tracked"

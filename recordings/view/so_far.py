@@ -29,6 +29,7 @@ from recordings.session import Session
 from recordings.tracks import ObjectShape, RigCalibration
 from recordings.view.mesh import outline_px, smooth_mesh
 from recordings.view.viewer import Viewer
+from recordings.whole_file import changed_ns, write_bytes
 
 APPLICATION = "toss-view --live"
 CAMERA = "d455"
@@ -77,7 +78,7 @@ class SessionView:
     def update(self) -> bool:
         """Draw what is known now; False where nothing changed."""
         files = sorted(require_live(self._session).glob("*.json*"))
-        seen = tuple((f.name, about) for f in files if (about := _changed_ns(f)) is not None)
+        seen = tuple((f.name, about) for f in files if (about := changed_ns(f)) is not None)
         if seen == self._seen:
             return False
         self._seen, self._updates = seen, self._updates + 1
@@ -149,8 +150,6 @@ class SessionView:
 
 def show_live(session: Path, screenshot: Path | None = None) -> Path | None:
     """The viewer until its window is closed, or one picture of what is known now. Raises BadInput, ViewerFailed."""
-    from recordings.whole_file import write_bytes
-
     with SessionView(session, headless=screenshot is not None) as view:
         if screenshot is None:
             view.stay()
@@ -214,10 +213,3 @@ def _shape(folder: Path) -> ObjectShape | None:
         return read_shape(folder)
     except (TosslabError, OSError):
         return None  # none yet, or it is being replaced
-
-
-def _changed_ns(path: Path) -> int | None:
-    try:
-        return path.stat().st_mtime_ns
-    except OSError:
-        return None

@@ -1,4 +1,4 @@
-"""`toss-calibrate` on cube_dev: what it writes, what it refuses, what it says. Truth: the camera poses that came with the recording."""
+"""`toss-calibrate` on cube_dev: what it writes, what it refuses, what it says. Truth: of the recording."""
 
 from __future__ import annotations
 

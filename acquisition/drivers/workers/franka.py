@@ -181,18 +181,12 @@ def guard(robot: Any, torque_nm: float, force_n: float) -> None:
 def main() -> NoReturn:
     end = WorkerEnd()
     host, realtime = sys.argv[1], sys.argv[2]
-    try:
+    with end.failing("missing", ImportError):
         from panda_py import libfranka
-    except ImportError as missing:
-        end.event("failed", kind="missing", reason=str(missing))
-        end.leave()
-    try:
+    with end.failing("connect", RuntimeError):
         config = {"ignore": libfranka.RealtimeConfig.kIgnore, "enforce": libfranka.RealtimeConfig.kEnforce}[realtime]
         robot = libfranka.Robot(host, config)
         guard(robot, **json.loads(sys.argv[3]))
-    except RuntimeError as error:
-        end.event("failed", kind="connect", reason=str(error))
-        end.leave()
     end.event("open", version=robot.server_version())
     try:
         ArmLoop(end, libfranka, robot).run()

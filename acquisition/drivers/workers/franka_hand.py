@@ -76,16 +76,10 @@ def obey(end: WorkerEnd, gripper: Any, message: dict[str, Any]) -> None:
 
 def main() -> NoReturn:
     end = WorkerEnd()
-    try:
+    with end.failing("missing", ImportError):
         from panda_py import libfranka
-    except ImportError as missing:
-        end.event("failed", kind="missing", reason=str(missing))
-        end.leave()
-    try:
+    with end.failing("connect", RuntimeError):
         gripper = libfranka.Gripper(sys.argv[1])
-    except RuntimeError as error:
-        end.event("failed", kind="connect", reason=str(error))
-        end.leave()
     end.event("open", version=gripper.server_version())
     reader = Reader(end, gripper)
     reader.start()

@@ -20,6 +20,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from io import TextIOWrapper
 from pathlib import Path
 from typing import Any, NoReturn
@@ -153,6 +154,15 @@ class WorkerEnd:
 
     def event(self, event: str, **detail: Any) -> None:
         self.emit(b"J", json.dumps({"event": event, **detail}).encode())
+
+    @contextmanager
+    def failing(self, kind: str, *expected: type[Exception]) -> Iterator[None]:
+        """Around a part of opening: what it raises is told to the driver as a failure of this kind, and ends all."""
+        try:
+            yield
+        except expected as error:
+            self.event("failed", kind=kind, reason=str(error))
+            self.leave()
 
     def leave(self) -> NoReturn:
         """End the process now: threads inside the vendor's library may still be waiting for an answer."""

@@ -256,23 +256,17 @@ class Follower:
 def main() -> NoReturn:
     end = WorkerEnd()
     host, options = sys.argv[1], json.loads(sys.argv[2])
-    try:
+    with end.failing("missing", ImportError):
         import dashboard_client
         import rtde_control
         import rtde_receive
-    except ImportError as missing:
-        end.event("failed", kind="missing", reason=str(missing))
-        end.leave()
-    try:
+    with end.failing("connect", Exception):  # ur-rtde throws what boost throws; whatever it is, the arm was not opened
         dashboard = dashboard_client.DashboardClient(host)
         dashboard.connect()
         about = {"model": dashboard.getRobotModel(), "serial": dashboard.getSerialNumber()}
         about["firmware"] = f"PolyScope {dashboard.polyscopeVersion()}"
         receive = rtde_receive.RTDEReceiveInterface(host, options["rate_hz"], VARIABLES)
         control = rtde_control.RTDEControlInterface(host, options["rate_hz"])
-    except Exception as error:  # ur-rtde throws what boost throws; whatever it is, the arm was not opened
-        end.event("failed", kind="connect", reason=str(error))
-        end.leave()
     end.event("open", **about)
     try:
         ArmLoop(end, receive, control, dashboard, options).run()

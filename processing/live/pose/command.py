@@ -27,6 +27,7 @@ from recordings.results.live import live_folder
 from recordings.results.shape_file import read_shape
 from recordings.session import Session
 from recordings.tracks import RigCalibration
+from recordings.whole_file import changed_ns
 
 NICE = 5
 IDLE_S = 0.002
@@ -96,7 +97,7 @@ class _Model:
         return pose
 
     def renew(self) -> None:
-        changed = _changed(self._folder / "shape.json")
+        changed = changed_ns(self._folder / "shape.json")
         still = len(self._recent) == STILL_FRAMES and float(np.ptp(self._recent, axis=0).max()) < STILL_M
         if changed is None or changed == self._of or (self.front is not None and self.front.tracking and not still):
             return
@@ -108,10 +109,3 @@ class _Model:
         camera, world = self._calibration.camera(CAMERA), self._calibration.find("world", CAMERA)
         self.front = PoseFront(camera, shape, background, world, depth_scale=scale)
         self._of, self._recent = changed, []
-
-
-def _changed(path: Path) -> int | None:
-    try:
-        return path.stat().st_mtime_ns
-    except OSError:
-        return None

@@ -14,7 +14,7 @@ from processing.segment.background.moving_camera import refuse_moving_camera
 from processing.sensor.noise import stereo_sigma_m
 from recordings.constants import MAD_TO_SIGMA_SHORT
 from recordings.errors import BadInput
-from recordings.geometry import CameraModel, Transform
+from recordings.geometry import CameraModel
 from recordings.records import RgbdFrame
 from recordings.results.stage_files import stage_arrays
 from recordings.tracks import RigCalibration
@@ -256,12 +256,7 @@ def calibrated_table_depth(calibration: RigCalibration, camera: str) -> Float32[
     world_from_camera = calibration.find("world", model.frame) if model is not None else None
     if model is None or world_from_camera is None:
         return None
-    return plane_depth(model, *plane_in_camera(world_from_camera))
-
-
-def plane_in_camera(world_from_camera: Transform) -> tuple[Float[Array, "3"], float]:
-    """The plane z = 0 of the world as n . x = offset in the camera frame."""
-    return world_from_camera.rotation[2], -float(world_from_camera.translation_m[2])
+    return plane_depth(model, world_from_camera.rotation[2], -float(world_from_camera.translation_m[2]))
 
 
 def plane_depth(camera: CameraModel, normal: Float[Array, "3"], offset_m: float) -> Float32[Array, "h w"]:

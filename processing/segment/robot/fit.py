@@ -280,7 +280,7 @@ def _outline_rows(
     image = view.draw(_links(observation, state, time_ns), FINGERS)
     outline = _outline(image.depth_m > 0, s.outlines)
     if outline is None:
-        return _nothing()
+        return _Residuals(np.zeros(0), np.zeros((0, 8)), np.zeros(0))
     pixels, outward = outline
     offset = edge_offsets(edges.difference, edges.known, pixels, outward, edges.reach_px, s)
     found = np.isfinite(offset)
@@ -357,10 +357,6 @@ def edge_offsets(
 
 def _joined(parts: Sequence[_Residuals]) -> _Residuals:
     return _Residuals(*(np.concatenate([getattr(p, n) for p in parts]) for n in ("r", "J", "raw")))
-
-
-def _nothing() -> _Residuals:
-    return _Residuals(np.zeros(0), np.zeros((0, 8)), np.zeros(0))
 
 
 def _solve(

@@ -364,12 +364,7 @@ def _differences(
 
 
 def _frames(scene: Scene, use: Bool[Array, " n"], config: AzimuthConfig) -> _Frames:
-    runs: list[list[int]] = []
-    for i in np.flatnonzero(use):
-        if runs and runs[-1][-1] == i - 1 and scene.store.stands_still(int(i) - 1, int(i)):
-            runs[-1].append(int(i))
-        else:
-            runs.append([int(i)])
+    runs = scene.store.still_runs(use)
     views = np.array([run[len(run) // 2] for run in runs], dtype=np.int64)
     chosen = set()
     for a in range(len(runs)):

@@ -49,7 +49,7 @@ class BodyConfig:
     """Where the outline lies farther out (a handle) or in (something covers the body), nothing is compared ..."""
     near_px: float = 6.0
     """... nor so near to such a place."""
-    outline_step_m: float = 0.004
+    wall_step_m: float = 0.004
     """Points of the outline along the wall."""
     bias_px: float = 0.15
     """Standard deviation of what all masks are too large by, known beforehand ..."""
@@ -101,21 +101,10 @@ class RoundBody:
         self._y[rk.LOW], self._y[rk.HIGH] = ends
 
     @property
-    def ends_m(self) -> tuple[float, float]:
-        """Height of both ends, along the axis from its point."""
-        return float(self._y[rk.LOW]), float(self._y[rk.HIGH])
-
-    @property
     def radius_m(self) -> float:
         """Median radius of the outside."""
         outside = int(self._sizes[0])
         return float(np.median(self._y[:outside][self._seen[:outside]]))
-
-    @property
-    def outline_rms_px(self) -> float:
-        """How far outlines lie off the profile's (root mean square; what stands off the body or covers it left out)."""
-        counted, _, squared = self._outline.sum(0)
-        return float(np.sqrt(squared / max(counted, 1)))
 
     @property
     def outline_share(self) -> float:
@@ -175,7 +164,7 @@ class RoundBody:
         H, g, cross = np.zeros((views, 6, 6)), np.zeros((views, 6)), np.zeros((views, 6, unknowns))
         Hyy, gy = np.zeros((unknowns, unknowns)), np.zeros(unknowns)
         settings = np.array(
-            [c.row_m, self._low_m, c.off_m, c.depth_m, c.outline_px, c.into_px, c.beyond_px, c.near_px, c.outline_step_m]
+            [c.row_m, self._low_m, c.off_m, c.depth_m, c.outline_px, c.into_px, c.beyond_px, c.near_px, c.wall_step_m]
         )
         rectified, axis, profile = (
             self._store.rectified,

@@ -11,6 +11,7 @@ from processing.sensor import view_layout as lay
 from processing.sensor.rectification import Rectification
 from processing.sensor.view import Crop, ViewConfig, ViewStore
 from processing.track.beam import Scene
+from processing.track.revolution import profile_kernels as rk
 from processing.track.revolution.axis import Axis
 from processing.track.revolution.azimuth import AzimuthConfig, given_azimuths
 from processing.track.revolution.profile import BodyConfig, RoundBody, anchored, is_round
@@ -119,10 +120,10 @@ def test_right_poses_show_the_body_as_large_as_it_is(cans: tuple[ViewStore, np.n
     store, truth = cans
     body = RoundBody(store, truth, np.ones(len(truth), dtype=bool), AXIS, BodyConfig())
     solved(body, truth, 6)
-    low, high = body.ends_m
-    assert high - low == pytest.approx(2 * HALF_M, abs=1e-3)
+    assert body._y[rk.HIGH] - body._y[rk.LOW] == pytest.approx(2 * HALF_M, abs=1e-3)
     assert body.radius_m == pytest.approx(RADIUS_M, abs=5e-4)
-    assert body.outline_rms_px < 0.4
+    counted, _, squared = body._outline.sum(0)
+    assert np.sqrt(squared / counted) < 0.4  # px
 
 
 def test_outlines_say_whether_a_body_is_round_about_an_axis(cans: tuple[ViewStore, np.ndarray]) -> None:
