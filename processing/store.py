@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from processing.engine.each import Engine, InTurn, Task
-from recordings.bounded.documents import read_json
+from recordings.bounded.documents import read_json, tuples
 from recordings.errors import BadInput, WriteFailed
 
 Result = TypeVar("Result")
@@ -159,13 +159,9 @@ def _finished(folder: Path, key: str, kind: type[Result]) -> Done[Result] | None
 def _as_result(kind: type[Result], document: Mapping[str, Any], folder: Path) -> Result:
     """A stage's result as it was written: lists are tuples again. Raises BadInput where it is another stage's."""
     try:
-        return kind(**{name: _tuples(value) for name, value in document.items()})
+        return kind(**{name: tuples(value) for name, value in document.items()})
     except TypeError as wrong:
         raise BadInput(f"{folder}/stage.json is damaged ({wrong}); remove that folder and run again") from wrong
-
-
-def _tuples(value: Any) -> Any:
-    return tuple(_tuples(x) for x in value) if isinstance(value, list) else value
 
 
 @contextmanager

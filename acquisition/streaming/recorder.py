@@ -278,9 +278,6 @@ def _topics(entry: DeviceEntry) -> list[str]:
         return [arm_codec.TOPIC]
     if entry.kind == "gripper":
         return []
-    streams = ["image"] if entry.kind == "mono" else ["color", "depth", *_infrared(entry)]
+    infrared = ["infrared1", "infrared2"] if entry.settings.get("infrared") else []
+    streams = ["image"] if entry.kind == "mono" else ["color", "depth", *infrared]
     return [_topic(entry, s) for s in streams]
-
-
-def _infrared(entry: DeviceEntry) -> list[str]:
-    return ["infrared1", "infrared2"] if entry.settings.get("infrared") else []

@@ -96,7 +96,8 @@ def calibrate_cameras(
             findings.append(Finding("note", f"{text} ({freed_px:.4f} px): kept"))
     findings += _judge(names, solved, seen)
     if dropped:
-        findings.append(Finding("note", f"left out for their residuals: {', '.join(_named(setup, dropped))}"))
+        named = [f"{setup.names[k]} {'the table' if view == setup.count else f'view {view}'}" for k, view in dropped]
+        findings.append(Finding("note", f"left out for their residuals: {', '.join(named)}"))
     findings += limit(hold_out["rms_px"], "the residual on views kept aside", "px", GOOD_PX, WORST_PX)
     figures = per_camera(names, solved, seen)
     report = Report(
@@ -290,10 +291,6 @@ def bad_views(solved: Solved, seen: Observations) -> list[tuple[int, int]]:
         usual = max(float(np.median(rms)), 0.05)
         bad += [(camera, v) for v, r in zip(numbers.tolist(), rms) if r > OUTLIER_VIEW * usual]
     return bad
-
-
-def _named(setup: _Setup, bad: Sequence[tuple[int, int]]) -> list[str]:
-    return [f"{setup.names[k]} {'the table' if view == setup.count else f'view {view}'}" for k, view in bad]
 
 
 def per_camera(names: Sequence[str], solved: Solved, seen: Observations) -> dict[str, dict[str, float]]:

@@ -5,7 +5,7 @@ segment. The numbers here are asked before that, or of two or three frames alone
 differs, and because each was set on its own data; one law may take their place. Elsewhere stay:
 
 - `sensor/still.py`, `sensor/view.py` (STILL_*): whether images changed, in grey levels and pixels, before any pose;
-- `segment/detect/`: whether a thing without a pose falls, in metres of what is seen of it;
+- `segment/detect/`, `track/flight.py`: whether a thing without a pose falls, in metres of what is seen of it;
 - `track/joint_refinement.py`, `smoother.py` (FLIGHT_CHANGE_*, also of the forecasts): standard deviations of
   residuals, no decisions;
 - `track/registration/support_plane.py`: how far what stands still seems to move between keyframes, in metres;

@@ -18,6 +18,11 @@ def as_dict(value: object) -> dict[str, Any]:
     return dict(value) if isinstance(value, Mapping) else {}
 
 
+def tuples(value: Any) -> Any:
+    """A JSON value as frozen records have it: tuples for lists."""
+    return tuple(tuples(x) for x in value) if isinstance(value, list) else value
+
+
 def json_object(text: str | bytes) -> dict[str, Any]:
     """A text that should be a JSON object; an empty one where it is not."""
     try:

@@ -18,7 +18,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from recordings.bounded.documents import read_json
+from recordings.bounded.documents import read_json, tuples
 from recordings.errors import BadInput, TosslabError
 from recordings.whole_file import write_json
 
@@ -176,7 +176,7 @@ def read_tosses(session: Path) -> list[TossSoFar]:
         document = _document(path)
         try:
             if document is not None:
-                found.append(TossSoFar(**{k: _tuples(v) for k, v in document.items()}))
+                found.append(TossSoFar(**{k: tuples(v) for k, v in document.items()}))
         except TypeError:
             continue
     return sorted(found, key=lambda t: t.toss)
@@ -206,7 +206,3 @@ def _document(path: Path) -> dict[str, Any] | None:
     except (TosslabError, OSError):
         return None
     return dict(found) if isinstance(found, dict) else None
-
-
-def _tuples(value: Any) -> Any:
-    return tuple(_tuples(x) for x in value) if isinstance(value, list) else value

@@ -197,7 +197,8 @@ def _words(scene: Scene) -> rrb.Container:
 
 def about_text(scene: Scene) -> str:
     """What is on the screen, for someone who sees it for the first time (Markdown)."""
-    lines = [f"# {scene.name}", f"{_count(len(scene.tosses))} of **{_object_name(scene)}**.", ""]
+    name = scene.session.object_name if scene.session is not None else "the object"
+    lines = [f"# {scene.name}", f"{_count(len(scene.tosses))} of **{name}**.", ""]
     if scene.session is not None and scene.session.calibration.cameras:
         lines += ["- **Points**: what the depth camera measured, in its own colours."]
         lines += ["- **Pyramids**: the cameras, with the image each one sees."]
@@ -244,10 +245,6 @@ def _tracking_words(body: Body) -> list[str]:
 
 def _count(tosses: int) -> str:
     return "One toss" if tosses == 1 else f"{tosses} tosses"
-
-
-def _object_name(scene: Scene) -> str:
-    return scene.session.object_name if scene.session is not None else "the object"
 
 
 def _color_word(color: tuple[int, int, int]) -> str:
