@@ -11,20 +11,15 @@ from typing import Protocol, runtime_checkable
 
 @runtime_checkable
 class Progress(Protocol):
-    """Told by a stage: `step` how far it is, `value` a figure on the way."""
+    """Told by a stage how far it is."""
 
     def step(self, done: int, total: int, note: str = "") -> None: ...
-
-    def value(self, name: str, value: float, *, at: int) -> None: ...
 
 
 class Silent:
     """For tests and callers that do not look."""
 
     def step(self, done: int, total: int, note: str = "") -> None:
-        pass
-
-    def value(self, name: str, value: float, *, at: int) -> None:
         pass
 
 
@@ -164,9 +159,6 @@ class Console:
         self._pace.report(now, done, total)
         text = f"{self._label}: {done}/{total}{f' {note}' if note else ''}"
         self._line.show(text, now, None if last else self._pace.left_s(now), last)
-
-    def value(self, name: str, value: float, *, at: int) -> None:
-        pass
 
 
 class Board:

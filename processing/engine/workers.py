@@ -147,9 +147,6 @@ class _Reporter:
             self._reported_s = now
             _to_parent.send((self._label, done, total, note))
 
-    def value(self, name: str, value: float, *, at: int) -> None:
-        pass
-
 
 class Shown:
     """`run.progress` where stages are computed in slots: sent to the board by the process that computes one."""

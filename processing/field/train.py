@@ -118,7 +118,6 @@ def _optimise(
             group.step(decay=0.1 ** (1 / max(config.steps, 1)))
         if step % 10 == 0:
             losses.append(float(loss.detach()))
-            progress.value("field loss", losses[-1], at=step)
         progress.step(config.pose_rounds + step + 1, config.pose_rounds + config.steps, "field: network")
     return tuple(losses)
 

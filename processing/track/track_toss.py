@@ -261,8 +261,7 @@ def _followed(
 ) -> tuple[list[Hypothesis], float, dict[int, list[Candidate]]]:
     """Hypotheses of the same frames: the beam forward, then once more backward with all that forward learned as the
     model; a beam backward that knows nothing of the first but where the last frame is; and the beam forward itself,
-    where both backward ones differ from it. Where they leave its flight open, that
-    solved as one adds its own."""
+    where both backward ones differ from it. Where they leave its flight open, that solved as one adds its own."""
     n = len(scene.times_s)
 
     def report(i: int, beam: list[Hypothesis]) -> None:

@@ -128,7 +128,6 @@ def test_work_of_which_nothing_is_done_yet_has_no_estimate(clock):
 
 def test_silent_is_silent(capsys):
     progress.Silent().step(1, 2)
-    progress.Silent().value("loss", 1.0, at=3)
     assert capsys.readouterr() == ("", "")
 
 

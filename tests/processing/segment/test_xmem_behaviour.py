@@ -33,9 +33,6 @@ class Counting:
         assert 0 <= done <= total
         self.steps += 1
 
-    def value(self, name: str, value: float, *, at: int) -> None:
-        pass
-
 
 @pytest.fixture(scope="module")
 def toss(tiny_world: Any) -> tuple[list[RgbdFrame], list[np.ndarray]]:

@@ -319,9 +319,6 @@ def test_an_interrupted_import_keeps_what_it_has_and_says_so(layout, tmp_path):
             if done > 0:
                 raise KeyboardInterrupt
 
-        def value(self, name: str, value: float, *, at: int) -> None:
-            pass
-
     with pytest.raises(KeyboardInterrupt):
         import_folder(layout.path, tmp_path / "session", progress=Impatient())
     session = Session.open(tmp_path / "session")
