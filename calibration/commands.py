@@ -19,7 +19,7 @@ from calibration.done import TOOL, Done, done
 from calibration.drift import bumps
 from calibration.hand_eye import LensAccuracy, calibrate_hand_eye
 from calibration.pictures import residual_picture
-from calibration.report import Finding
+from calibration.report import Finding, undetected
 from calibration.tags.faults import explain_absence
 from calibration.views import (
     COLOR,
@@ -56,6 +56,8 @@ def intrinsics(path: Path, args: argparse.Namespace, progress: Progress) -> Done
                 name, views.sizes[name], views.board[name], args.lens or LENSES, given, args.anew or bool(args.lens)
             )
         lenses |= _solved_together(session, views, lenses)
+        dead = undetected(views.lost)
+        lenses = {n: replace(lens, report=lens.report.with_findings(dead)) for n, lens in lenses.items()}
         reports = [replace(lens.report, kind=f"intrinsics of {name}") for name, lens in lenses.items()]
         picture = _picture(session, "intrinsics", views, lenses)
         if args.dry_run or any(r.verdict == "refused" for r in reports):
@@ -91,7 +93,7 @@ def _together_with(lens: Lens, placed: PlacedCameras, name: str, views: Sequence
     text = f"{name}: solved with all cameras' views together, which moved the focal length {change:+.2f} %"
     if not taken:
         text = f"{name}: solved with all cameras' views together, its own views would be explained worse: not taken"
-    report = replace(lens.report, findings=(*lens.report.findings, Finding("note", text)))
+    report = lens.report.with_findings([Finding("note", text)])
     return replace(lens, model=placed.models[name] if taken else lens.model, report=report)
 
 
@@ -137,10 +139,10 @@ def cameras(path: Path, args: argparse.Namespace, progress: Progress) -> Done:
         reference = COLOR if COLOR in models else sorted(models)[0]
         still = views.table if table_target(session.calibration) else None
         placed = calibrate_cameras(models, views.board, reference, still, args.lenses)
-        findings = [*_together(views), *bumps(views.table)]
+        findings = [*_together(views), *undetected(views.lost), *bumps(views.table)]
         if reference == COLOR:
             findings += _size_by_depth(session, views, placed)
-        report = replace(placed.report, findings=(*placed.report.findings, *findings))
+        report = placed.report.with_findings(findings)
         picture = residual_picture(
             store.work_folder(session) / "cameras.png",
             f"{session.name}: cameras",
@@ -208,21 +210,22 @@ def hand_eye(path: Path, args: argparse.Namespace, progress: Progress) -> Done:
         lens = as_dict(as_dict(session.calibration.residuals.get("intrinsics")).get(args.camera))
         accuracy = LensAccuracy.stated(as_dict(lens.get("uncertainty")))
         solved = calibrate_hand_eye(model, board_views, base_from_tool, args.mounting, lens=accuracy)
+        report = solved.report.with_findings(undetected(views.lost))
         picture = residual_picture(
             store.work_folder(session) / "hand_eye.png",
-            f"{session.name}: {solved.report.kind}",
+            f"{session.name}: {report.kind}",
             {args.camera: views.sizes[args.camera]},
             {args.camera: solved.pixels},
             {args.camera: solved.residual_px},
         )
-        if args.dry_run or solved.report.verdict == "refused":
-            return done([solved.report], None, [picture], not args.dry_run)
+        if args.dry_run or report.verdict == "refused":
+            return done([report], None, [picture], not args.dry_run)
         mount = "base" if args.mounting == "eye-to-hand" else "tool"
         place = Transform.from_matrix(args.camera, mount, solved.camera_from_mount)
         calibration = store.updated(session.calibration, transforms=[place], replaces=[mount])
         more = {"mounting": args.mounting, "held_from_board": solved.held_from_board.tolist()}
-        written = store.write(session, calibration, "hand_eye", solved.report, **more)
-        return done([solved.report], written, [picture], True)
+        written = store.write(session, calibration, "hand_eye", report, **more)
+        return done([report], written, [picture], True)
 
 
 def _robot_poses(session: Session, views: BoardViews) -> tuple[Float[Array, "n 4 4"], list[int]]:

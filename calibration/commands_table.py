@@ -27,7 +27,7 @@ from calibration.ground_plane import (
     table_points,
 )
 from calibration.pictures import table_picture
-from calibration.report import Finding
+from calibration.report import Finding, undetected
 from calibration.tags.detect import detect_tags
 from calibration.tags.faults import explain_absence
 from calibration.tags.toss_object import solve_toss
@@ -55,12 +55,12 @@ INDEPENDENT_CORNERS = 3
 def table(path: Path, args: argparse.Namespace, progress: Progress) -> Done:
     with Session.open(path) as session:
         calibration = session.calibration
-        table_views = _table_views(session, progress)
+        table_views, lost = _table_views(session, progress)
         models = {n: calibration.cameras[n] for n in table_views}
         places = camera_from_rig(calibration, list(table_views), COLOR)
         target = table_target(calibration)
         tags_px, hold_out, tags, rig_from_world = None, {}, None, None
-        missing: tuple[Finding, ...] = ()
+        unseen = undetected(lost)
         if target is not None and any(len(v) >= 4 for v in table_views.values()):
             solved = place_world(models, places, table_views)
             tags_px, rig_from_world = solved.rms_px, solved.scene.rig_from_body[0]
@@ -69,15 +69,14 @@ def table(path: Path, args: argparse.Namespace, progress: Progress) -> Done:
             hold_out = _without_one_camera(models, places, table_views, rig_from_world)
         elif target is not None:
             why = explain_absence(grey_images(session.toss(session.tosses[0]), COLOR)[1], calibration.tag_family)
-            missing = (Finding("warning", f"no table tags found: {why}"),)
+            unseen.append(Finding("warning", f"no table tags found: {why}"))
         depth_points = _depth_points(session)
         height_m = _paper_m(target) if tags is not None else 0.0
         plane, scale, residuals = fit_table(tags, depth_points, height_m)
         world_from_rig = _world_from_rig(session, rig_from_world, args.move_world)
         plane_world = plane.in_frame(world_from_rig)
         gravity = _gravity(session, args, world_from_rig, progress)
-        report = judge_table(plane_world, residuals, hold_out, tags_px, scale, gravity)
-        report = replace(report, findings=(*report.findings, *missing))
+        report = judge_table(plane_world, residuals, hold_out, tags_px, scale, gravity).with_findings(unseen)
         picture = _picture(session, plane_world, world_from_rig, depth_points, scale, target)
         if args.dry_run or report.verdict == "refused":
             return done([report], None, [picture], not args.dry_run)
@@ -118,12 +117,13 @@ def _plane_entry(plane: Plane, tags: object, depth: object) -> dict[str, object]
     }
 
 
-def _table_views(session: Session, progress: Progress) -> dict[str, TargetView]:
-    """The table's tags in every camera, over images of several tosses."""
+def _table_views(session: Session, progress: Progress) -> tuple[dict[str, TargetView], int]:
+    """The table's tags in every camera, over images of several tosses, and on how many the detector died."""
     target = table_target(session.calibration)
     table_views: dict[str, TargetView] = {}
+    lost = 0
     if target is None:
-        return table_views
+        return table_views, lost
     with_mono = [n for n in session.tosses if mono_cameras(session, session.toss(n).cameras())]
     for camera in sorted({c for n in session.tosses[:1] + tuple(with_mono[:1]) for c in session.toss(n).cameras()}):
         if camera not in session.calibration.cameras:
@@ -132,10 +132,11 @@ def _table_views(session: Session, progress: Progress) -> dict[str, TargetView]:
         times_ns, images = grey_images(session.toss(number), camera)
         some = [images[k] for k in np.unique(np.linspace(0, len(times_ns) - 1, STILL_IMAGES).astype(int))]
         found = detect_tags(some, target.family, store.work_folder(session), progress, response=response_of(camera))
+        lost += len(found.lost)
         view = still_view([tag_view(target, tags) for tags in found])
         if view is not None:
             table_views[camera] = view
-    return table_views
+    return table_views, lost
 
 
 def _corners_in_rig(

@@ -16,7 +16,7 @@ from calibration.cameras.poses import inverse_poses
 from calibration.cameras.targets import Tags, tag_view
 from calibration.done import TOOL, Done, done
 from calibration.pictures import offsets_picture, residual_picture
-from calibration.report import Finding, Report, limit
+from calibration.report import Finding, Report, limit, undetected
 from calibration.tags.tagged_object import TaggedObject, solve_tagged_object
 from calibration.tags.toss_object import SolvedToss, solve_toss, tag_ids, tag_sizes, triggered
 from calibration.time_offset import (
@@ -76,8 +76,7 @@ def time(path: Path, args: argparse.Namespace, progress: Progress) -> Done:
         reports = {"mono": offset_report("mono", COLOR, mono, failed)}
         if arm:
             reports["arm"] = offset_report("arm", COLOR, arm, {})
-        first = reports["mono"]
-        reports["mono"] = replace(first, findings=(*first.findings, *findings))
+        reports["mono"] = reports["mono"].with_findings(findings)
         picture = _offsets_picture(session, reports, {"mono": mono, "arm": arm})
         if args.dry_run or any(r.verdict == "refused" for r in reports.values()):
             return done(list(reports.values()), None, [picture], not args.dry_run)
@@ -171,7 +170,7 @@ def cameras_from_object(path: Path, args: argparse.Namespace, progress: Progress
         if color is not None:
             # everything hangs on the D455 where it can be tied to the object too
             transforms = [color, *(color @ t for t in transforms)]
-        report = _object_report(solved, color is not None)
+        report = _object_report(solved, color is not None).with_findings(undetected(tags.lost))
         picture = residual_picture(
             store.work_folder(session) / "cameras_from_object.png",
             f"{session.name}: cameras from the tagged object",

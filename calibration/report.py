@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 Verdict = Literal["good", "doubtful", "refused"]
@@ -38,6 +38,9 @@ class Report:
     def verdict(self) -> Verdict:
         levels = {f.level for f in self.findings}
         return "refused" if "refused" in levels else "doubtful" if "warning" in levels else "good"
+
+    def with_findings(self, more: Iterable[Finding]) -> Report:
+        return replace(self, findings=(*self.findings, *more))
 
     def reasons(self) -> list[str]:
         return [f"{f.level}: {f.text}" for f in self.findings]
@@ -76,6 +79,14 @@ def limit(value: float, what: str, unit: str, fine: float, most: float) -> list[
     return [
         Finding("warning" if value <= most else "refused", f"{what} is {value:.3g} {unit}, wanted at most {fine:g}")
     ]
+
+
+def undetected(images: int, where: str = "") -> list[Finding]:
+    """What is said of images on which the tag detector died twice: they count as if nothing were seen in them."""
+    if not images:
+        return []
+    text = f"{where}the tag detector died on {images} images: tags in them are missing here: run it again"
+    return [Finding("warning", f"{text}; where they stay lost, look at the recording with `toss-view`")]
 
 
 def _said(value: Any) -> str:

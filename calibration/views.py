@@ -13,7 +13,7 @@ from jaxtyping import Float, Int64, UInt8
 from numpy import ndarray as Array
 
 from calibration.cameras.targets import NOTHING, Tags, Target, TargetView, find_target, tag_view, target_from_document
-from calibration.tags.detect import Refinement, Response, TagDetection, detect_tags
+from calibration.tags.detect import Refinement, Response, TagDetection, TagLists, detect_tags
 from recordings.errors import BadInput
 from recordings.mcap import codec
 from recordings.progress import Progress
@@ -55,13 +55,14 @@ class _Grey(Sequence):
 @dataclass(frozen=True, eq=False)
 class BoardViews:
     """`board[camera][k]` and `table[camera][k]` are of instant k (`times_ns[k]`); `spread_ns`: how far apart the stamps
-    of one instant lie at most."""
+    of one instant lie at most; `lost`: images on which the tag detector died."""
 
     times_ns: Int64[Array, " v"]
     board: Mapping[str, list[TargetView]]
     table: Mapping[str, list[TargetView]]
     sizes: Mapping[str, tuple[int, int]]
     spread_ns: int
+    lost: int = 0
 
     @property
     def seen_at_all(self) -> bool:
@@ -78,12 +79,13 @@ def read_board_views(session: Session, cache: Path | None, progress: Progress | 
     target = board_of(session)
     table = table_target(session.calibration)
     with Toss(path) as toss:
-        found = {}
+        found, lost = {}, 0
         for camera in toss.cameras():
             times_ns, images = grey_images(toss, camera)
-            both = _find_both(target, table, images, camera, cache, progress)
+            board, on_table, dead = _find_both(target, table, images, camera, cache, progress)
+            lost += dead
             size = images[0].shape[::-1] if len(images) else (0, 0)
-            found[camera] = (times_ns, *both, size)
+            found[camera] = (times_ns, board, on_table, size)
     if not found:
         raise BadInput(f"{path} has no images; wanted views of the calibration board by the cameras")
     instants, spread_ns = _instants({camera: f[0] for camera, f in found.items()})
@@ -93,6 +95,7 @@ def read_board_views(session: Session, cache: Path | None, progress: Progress | 
         {c: [f[2][at[c]] if c in at else NOTHING for _, at in instants] for c, f in found.items()},
         {c: (int(f[3][0]), int(f[3][1])) for c, f in found.items()},
         spread_ns,
+        lost,
     )
 
 
@@ -103,16 +106,20 @@ def _find_both(
     camera: str,
     cache: Path | None,
     progress: Progress | None,
-) -> tuple[list[TargetView], list[TargetView]]:
+) -> tuple[list[TargetView], list[TargetView], int]:
+    """The board and the table's tags in every image, and on how many images the tag detector died."""
     response = response_of(camera)
     if isinstance(target, Tags) and (table is None or table.family == target.family):
         lists = detect_tags(
             images, target.family, cache, progress, response=response, total=len(images), refinement="pattern"
         )
         on_table = [tag_view(table, tags) if table else NOTHING for tags in lists]
-        return [tag_view(target, tags) for tags in lists], on_table
+        return [tag_view(target, tags) for tags in lists], on_table, len(lists.lost)
     board = find_target(target, images, response, cache, progress)
-    return board, find_target(table, images, response, cache, progress) if table else [NOTHING] * len(images)
+    if table is None:
+        return board, [NOTHING] * len(images), board.lost
+    on_table = find_target(table, images, response, cache, progress)
+    return board, on_table, board.lost + on_table.lost
 
 
 def _instants(times_ns: Mapping[str, Int64[Array, " n"]]) -> tuple[list[tuple[int, dict[str, int]]], int]:
@@ -153,11 +160,15 @@ def table_target(calibration: RigCalibration) -> Tags | None:
 
 @dataclass(frozen=True, eq=False)
 class TossTags:
-    """Tags in one toss: stamps and tags per image by camera."""
+    """Tags in one toss: stamps and tags per image by camera. `lost`: images on which the detector died."""
 
     toss: int
     times_ns: Mapping[str, Int64[Array, " n"]]
-    tags: Mapping[str, list[list[TagDetection]]]
+    tags: Mapping[str, TagLists]
+
+    @property
+    def lost(self) -> int:
+        return sum(len(lists.lost) for lists in self.tags.values())
 
     def of_object(self, ids: Sequence[int] | None, table: Tags | None) -> Mapping[str, list[list[TagDetection]]]:
         """The tags of the object: those of the given ids, or all that are not on the table."""

@@ -62,7 +62,8 @@ class D455RefinementConfig:
 class D455Refinement:
     """`off_m`, `off_rad`: how far the D455 stands from its place in the calibration. `corner_px`: median distance of
     its corners from where the mono cameras' poses put them, where those are sure. `offset_s`: what is to be added to
-    the mono cameras' stamps so that the poses of moving frames meet the D455's view, and its standard deviation."""
+    the mono cameras' stamps so that the poses of moving frames meet the D455's view, and its standard deviation.
+    `lost_images`: colour images on which the tag detector died."""
 
     tosses: Mapping[int, TossTruth]
     off_m: float
@@ -71,6 +72,7 @@ class D455Refinement:
     detections: int
     offset_s: float
     offset_std_s: float
+    lost_images: int = 0
 
     @property
     def frames(self) -> int:
@@ -133,8 +135,9 @@ def refine_by_d455(
     world = calibration.find("world", model.frame)
     if world is None:
         return None
-    seen = _detections(session, wanted, solved, config, progress)
-    return by_detections(model, np.linalg.inv(world.matrix), seen, truths, limits, config)
+    seen, lost_images = _detections(session, wanted, solved, config, progress)
+    own = by_detections(model, np.linalg.inv(world.matrix), seen, truths, limits, config)
+    return own and replace(own, lost_images=lost_images)
 
 
 def by_detections(
@@ -170,7 +173,8 @@ def _wanted(truth: TossTruth, config: D455RefinementConfig) -> list[int]:
 
 def _detections(
     session: Session, wanted: Mapping[int, list[int]], solved: Solved, config: D455RefinementConfig, progress: Progress
-) -> list[ColorTags]:
+) -> tuple[list[ColorTags], int]:
+    """The body's tags in the colour images of these frames, and on how many images the detector died."""
     total = sum(map(len, wanted.values()))
     lists = detect_tags(_images(session, wanted), config.family, None, progress, response="srgb", total=total)
     every = iter(lists)
@@ -182,7 +186,7 @@ def _detections(
             tags = [t for t in tags if ids.count(t.tag_id) == 1]
             if tags:
                 found.append(color_tags(toss, frame, tags, solved.layout, solved.sizes_m))
-    return found
+    return found, len(lists.lost)
 
 
 def _images(session: Session, wanted: Mapping[int, list[int]]) -> Iterator[UInt8[Array, "h w"]]:

@@ -109,6 +109,11 @@ def find_truth(
     verdict = judge(solved, detections, spread_ns, notes, calibration)
     if own is not None and (late := _late(own, session)):
         verdict = replace(verdict, warnings=(*verdict.warnings, late))
+    if own is not None and own.lost_images:
+        died = (
+            f"the tag detector died on {own.lost_images} of the D455's images: their poses are the mono cameras' alone"
+        )
+        verdict = replace(verdict, warnings=(*verdict.warnings, died))
     final = {toss: t.without_guesses() for toss, t in (own.tosses if own is not None else truths).items()}
     return SessionTruth(solved, final, verdict, sizes, own)
 

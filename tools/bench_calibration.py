@@ -212,7 +212,8 @@ def published_lens(real: RealSet, size: tuple[int, int]) -> CameraModel:
 
 
 def pair() -> str:
-    """The stereo set's cameras solved together: rotation from left to right against extrinsics.yml."""
+    """The stereo set's cameras solved together: rotation from left to right against extrinsics.yml. What the commands
+    `intrinsics`, then `cameras` do is the last of the three."""
     sides = {"mono0": REAL["barry-left"], "mono1": REAL["barry-right"]}
     seen = {name: find_target(real.board, real.images()) for name, real in sides.items()}
     if not all(seen.values()):
@@ -221,8 +222,9 @@ def pair() -> str:
     file = cv2.FileStorage(str(SETS / "Barry-Liang/stereoCalibrate/extrinsics.yml"), cv2.FILE_STORAGE_READ)
     published = file.getNode("R").mat()
     text = "barry-pair    "
-    for kind, freed in (("lenses fixed", ()), ("lenses free", tuple(lenses))):
+    for kind, freed in (("each lens alone", ()), ("lenses solved together", tuple(lenses)), ("then as fixed", ())):
         placed = calibrate_cameras(lenses, seen, "mono0", None, freed=freed)
+        lenses = placed.models
         (left_from_right,) = (t for t in placed.transforms if t.source == "mono1")
         off = float(np.linalg.norm(cv2.Rodrigues(left_from_right.rotation @ published)[0]))
         focals = "/".join(f"{placed.models[n].fx:.2f}" for n in lenses)

@@ -11,9 +11,12 @@ from __future__ import annotations
 
 import argparse
 import multiprocessing
+import os
 import sys
 import time
+from collections.abc import Iterator
 from importlib import import_module
+from multiprocessing.connection import Connection, wait
 
 TRACK = "processing.track.kernels"
 PROFILE = "processing.track.revolution.profile_kernels"
@@ -67,13 +70,43 @@ def main() -> int:
     given = parser.parse_args()
     begun, cpu_s = time.monotonic(), 0.0
     modules = list(dict.fromkeys(module for module, _ in KERNELS))
-    with multiprocessing.get_context("spawn").Pool(given.jobs or None) as pool:
-        for module, seconds in pool.imap_unordered(compiled, modules):
-            cpu_s += seconds
-            if seconds > 1:
-                print(f"compiled {module} in {seconds:.1f} CPU-s", flush=True)
+    for module, seconds in side_by_side(modules, given.jobs or os.cpu_count() or 1):
+        cpu_s += seconds
+        if seconds > 1:
+            print(f"compiled {module} in {seconds:.1f} CPU-s", flush=True)
     print(f"{len(KERNELS)} kernels are there after {time.monotonic() - begun:.0f} s ({cpu_s:.1f} CPU-s)")
     return 0
+
+
+def side_by_side(modules: list[str], jobs: int) -> Iterator[tuple[str, float]]:
+    """`compiled` of every module, as they end, in so many processes. They are told through pipes: a Pool's locks need a
+    /dev/shm that can be written to."""
+    context = multiprocessing.get_context("spawn")
+    waiting = modules[::-1]
+    busy = []
+    for _ in range(min(jobs, len(modules))):
+        here, there = context.Pipe()
+        context.Process(target=_compiler, args=(there,), daemon=True).start()
+        there.close()
+        here.send(waiting.pop())
+        busy.append(here)
+    while busy:
+        for one in [c for c in busy if c in wait(busy)]:
+            yield one.recv()
+            if waiting:
+                one.send(waiting.pop())
+            else:
+                busy.remove(one)
+                one.close()
+
+
+def _compiler(orders: Connection) -> None:
+    while True:
+        try:
+            module = orders.recv()
+        except EOFError:
+            return
+        orders.send(compiled(module))
 
 
 def compiled(module: str) -> tuple[str, float]:

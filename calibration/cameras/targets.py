@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -100,22 +100,30 @@ def numbered_marks(views: Sequence[tuple[int, TargetView]]) -> tuple[list[Int[Ar
     return [np.searchsorted(known, mine).astype(np.int64) for mine in marks], len(known)
 
 
+class TargetViews(list[TargetView]):
+    """The target in every image, in the images' order. `lost`: on how many the tag detector died."""
+
+    def __init__(self, views: Iterable[TargetView], lost: int = 0) -> None:
+        super().__init__(views)
+        self.lost = lost
+
+
 def find_target(
     target: Target,
     images: Sequence[UInt8[Array, "h w"]],
     response: Response = "linear",
     cache: Path | None = None,
     progress: Progress | None = None,
-) -> list[TargetView]:
+) -> TargetViews:
     """The target in every image; views without points where it is not seen."""
     if isinstance(target, Tags):
         lists = detect_tags(
             images, target.family, cache, progress, response=response, total=len(images), refinement="pattern"
         )
-        return [tag_view(target, tags) for tags in lists]
+        return TargetViews((tag_view(target, tags) for tags in lists), len(lists.lost))
     if isinstance(target, Charuco):
-        return _find_charuco(target, images)
-    return [_find_chessboard(target, image) for image in images]
+        return TargetViews(_find_charuco(target, images))
+    return TargetViews(_find_chessboard(target, image) for image in images)
 
 
 def tag_view(target: Tags, found: Sequence[TagDetection]) -> TargetView:

@@ -12,7 +12,7 @@ from numpy import ndarray as Array
 from calibration import store
 from calibration.cameras.targets import Tags
 from calibration.drift import age_findings, drift_findings
-from calibration.report import Finding, limit
+from calibration.report import Finding, limit, undetected
 from calibration.tags.faults import explain_absence, sizes_by_triangulation, wrong_sizes
 from calibration.tags.tagged_object import TaggedObject, solve_tagged_object
 from calibration.time_offset import (
@@ -72,7 +72,11 @@ def solve_toss(session: Session, number: int, args: argparse.Namespace, progress
     measured = sizes_by_triangulation(models, places, detections)
     size_m = tag_sizes(args, of_object, measured)
     body = solve_tagged_object(models, detections, size_m, places)
-    findings = [*(wrong_sizes(size_m, measured) if args.tag_size else []), *_moved(session, fixed, tags)]
+    findings = [
+        *undetected(tags.lost, f"toss {number}: "),
+        *(wrong_sizes(size_m, measured) if args.tag_size else []),
+        *_moved(session, fixed, tags),
+    ]
     findings += limit(
         body.solved.rms_px, f"toss {number}: the residual of the object's tags", "px", OBJECT_PX, WORST_OBJECT_PX
     )

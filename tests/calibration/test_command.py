@@ -9,6 +9,7 @@ import pytest
 
 from calibration.cameras.poses import angle_deg, inverse_poses
 from calibration.cli import main
+from calibration.tags.detect import DetectorChild, DetectorDied
 from recordings.tracks import RigCalibration
 from recordings.verify.verify import verify
 
@@ -82,6 +83,24 @@ def test_table_tags_that_no_camera_sees_are_a_warning_of_the_report(cube_copy, c
     (cube_copy / "calibration.json").write_text(json.dumps(calibration))
     main(["table", str(cube_copy), "--dry-run"])
     assert "no table tags found" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("command", [pytest.param(["cameras"], marks=pytest.mark.slow), ["table", "--tag-size", TAG_M]])
+def test_images_on_which_the_tag_detector_dies_are_a_warning_of_the_report(command, cube_copy, monkeypatch, capsys):
+    for kept in cube_copy.rglob("tags-*.npz"):
+        kept.unlink()
+    detect, killers = DetectorChild.detect, []
+
+    def dies_on_one(self, picture):
+        killers.append(picture.tobytes())
+        if picture.tobytes() == killers[0]:
+            raise DetectorDied("gone")
+        return detect(self, picture)
+
+    monkeypatch.setattr(DetectorChild, "detect", dies_on_one)
+    main([command[0], str(cube_copy), *command[1:], "--dry-run", "--json"])
+    (said,) = json.loads(capsys.readouterr().out)["calibrations"]
+    assert any("the tag detector died on 1 images" in reason for reason in said["reasons"])
 
 
 def test_what_is_missing_is_named_with_what_to_type(cube_copy, sample_path, capsys):
