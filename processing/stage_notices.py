@@ -21,6 +21,8 @@ from recordings.mcap import arm_codec
 from recordings.notices import Notice
 from recordings.results.stage_files import stage_document
 
+SCALE_SAID = 0.001
+"""A correction of depth by less is told by the record only."""
 NOISY = 2.0
 """Depth that errs by this much more than the data sheet says is told."""
 MANY_UNFIT = 1 / 3
@@ -54,13 +56,12 @@ def of_rig(run: Run, done: Done[RigResult]) -> list[Notice]:
         seen = f"the robot is not cut out of the images: {robot}"
         do = "where it touches the object, the masks may hold a part of it: look at them with `toss-view RESULTS`"
         found.append(Notice("rig", "medium", seen, do))
-    scale = result.depth_scale
-    if scale != 1.0:
-        side, sigma = "far" if scale > 1 else "near", 100 * (result.scale_sigma or 0.0)
-        seen = (
-            f"the camera's depth reads {100 * abs(scale - 1):.2f} +- {sigma:.2f} % too {side}: all depth was corrected"
-        )
-        found.append(Notice("rig", "low", seen, sure="likely"))
+    off, told, sigma = result.depth_scale - 1, result.estimated_scale, result.scale_sigma
+    if told is not None and sigma is not None and abs(off) >= SCALE_SAID:
+        side = "far" if told > 1 else "near"
+        seen = f"the camera's depth reads {100 * abs(told - 1):.2f} +- {100 * sigma:.2f} % too {side}"
+        by = f"all depth was corrected by {100 * abs(off):.2f} %, the more the surer that is"
+        found.append(Notice("rig", "low", f"{seen}: {by}", sure="likely"))
     return found
 
 

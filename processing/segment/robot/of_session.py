@@ -26,8 +26,8 @@ BASE = "base"
 @dataclass(frozen=True, eq=False)
 class Rig:
     """The result. `camera_from_base` is None where no robot is known; `arm_delay_s` is added to an image's time before
-    the joints are asked. `depth_scale` is what depth is to be divided by: 1 where the estimate is not significant;
-    `estimated_scale` and `scale_sigma` are the estimate itself (NaN where there is none)."""
+    the joints are asked. `depth_scale` is what depth is to be divided by: the posterior's mean;
+    `estimated_scale` and `scale_sigma` are what the session alone says (NaN where it says nothing)."""
 
     camera_from_base: Transform | None
     arm_delay_s: float

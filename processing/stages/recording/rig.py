@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from processing.run import CAMERA, Run
-from processing.segment.background.depth_scale import TableScale, accepted_scale, table_scale
+from processing.segment.background.depth_scale import TableScale, posterior_scale, table_scale
 from processing.segment.background.static_scene import StaticScene
 from processing.segment.robot.fit import RobotFit, RobotObservation, choose_observations, fit_robot
 from processing.segment.robot.of_session import RobotOfSession
@@ -22,7 +22,7 @@ from processing.store import Done
 from recordings.geometry import Transform
 from recordings.robot.arm import PANDA_TOOL
 
-VERSION = 2
+VERSION = 3
 HALF_STEP_NS = 5_000_000
 
 
@@ -52,7 +52,7 @@ def _refine(run: Run, scene: Done, folder: Path) -> RigResult:
     why_not = robot.missing(run.recorded)
     fit = None if why_not else _fit(run, robot, learned, table)
     scale, sigma = _scale(fit, table)
-    used = accepted_scale(scale, sigma, run.config.rig.scale)
+    used = posterior_scale(scale, sigma, run.config.rig.scale)
     base = fit.camera_from_base if fit is not None else robot.camera_from_base
     document = {
         "camera_from_base": None if why_not or base is None else base.matrix.tolist(),

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import pytest
 
-from processing.segment.background.depth_scale import DepthScaleSettings, accepted_scale, table_scale
+from processing.segment.background.depth_scale import DepthScaleSettings, posterior_scale, table_scale
 from processing.segment.background.static_scene import StaticScene, calibrated_table_depth
 from processing.segment.robot.fit import (
     RobotFitSettings,
@@ -235,16 +235,32 @@ def test_the_table_tells_the_depth_scale(tiny_world: Any) -> None:
     found = table_scale(scene, tiny_world.camera, world_from_camera, DepthScaleSettings())
     assert found is not None
     assert found.scale == pytest.approx(1.01, abs=3e-4)
-    assert accepted_scale(found.scale, found.sigma, DepthScaleSettings()) == found.scale
-    assert accepted_scale(1.0005, found.sigma, DepthScaleSettings()) == 1.0
+    assert posterior_scale(found.scale, found.sigma, DepthScaleSettings()) == pytest.approx(1.01, abs=4e-4)
 
 
-def test_a_tilted_table_is_the_calibrations_error_and_its_scale_is_not_accepted(tiny_world: Any) -> None:
+def test_a_tilted_table_is_the_calibrations_error_and_its_scale_counts_less(tiny_world: Any) -> None:
     scene, world_from_camera = table_scene(tiny_world, 1.004, tilt_deg=0.3)
     found = table_scale(scene, tiny_world.camera, world_from_camera, DepthScaleSettings())
     assert found is not None
     assert found.tilt_deg == pytest.approx(0.3, abs=0.02)
-    assert accepted_scale(found.scale, found.sigma, DepthScaleSettings()) == 1.0
+    assert 0.7 < found.sigma / np.deg2rad(0.3) < 2.0  # as far off as the table is high, or somewhat more
+
+
+def test_the_scale_is_the_posteriors_mean() -> None:
+    settings = DepthScaleSettings(among_cameras=0.01)
+    assert posterior_scale(1.02, 0.01, settings) == pytest.approx(1.01)
+    assert posterior_scale(0.98, 0.0, settings) == pytest.approx(0.98)
+    assert posterior_scale(float("nan"), float("nan"), settings) == 1.0
+
+
+def test_what_lies_on_the_table_does_not_move_its_scale(tiny_world: Any) -> None:
+    scene, world_from_camera = table_scene(tiny_world, 1.01)
+    cluttered = scene.depth_m.copy()
+    h, w = cluttered.shape
+    cluttered[h // 3 : 2 * h // 3, w // 3 : 2 * w // 3] -= 0.015
+    found = table_scale(replace(scene, depth_m=cluttered), tiny_world.camera, world_from_camera, DepthScaleSettings())
+    assert found is not None
+    assert found.scale == pytest.approx(1.01, abs=1e-3)
 
 
 def test_corrected_depth_is_divided_and_no_return_stays() -> None:
