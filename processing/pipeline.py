@@ -14,7 +14,7 @@ from processing.first_pass import first_pass, start_alone
 from processing.images import Images, every_frame, raw_images
 from processing.passes import Pass
 from processing.record import write_record
-from processing.run import Run, each
+from processing.run import Run, each, with_noise
 from processing.stages.field import learn_field
 from processing.stages.find import find_object
 from processing.stages.lose import lose, without_lost
@@ -42,7 +42,7 @@ def process(run: Run, variant: Variant, scope: Scope, model: Path | None = None)
     run = with_depth_in_time(run, scene, all_masks(run, scene, rig, found))
     masks = all_masks(run, scene, rig, found)  # read again, but where depth's stamps were wrong
     noise = measure_noise(run, scene)
-    run = replace(run, noise=noise.result.noise, warnings=(*run.warnings, *say.of_noise(noise)))
+    run = replace(with_noise(run, noise.result.noise), warnings=(*run.warnings, *say.of_noise(noise)))
     run = without_lost(run, masks)
     images = {t: raw_images(run, t, rig, masks[t]) for t in run.tosses}
     if model is not None:

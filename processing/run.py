@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Hashable, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, TypeVar
 
 from processing.backends import settings_of
@@ -86,6 +86,13 @@ def toss_keys(run: Run, toss: int) -> dict[str, str]:
 def matcher_settings(run: Run, config: Any) -> dict[str, Any]:
     """The settings of a stage that matches features: its own, and the matcher where it is not the default."""
     return {**plain(config), **settings_of(run.config.backends.matcher, run.config.backends)}
+
+
+def with_noise(run: Run, noise: DepthNoise) -> Run:
+    """The run in which depth is believed as far as this session's noise allows."""
+    track = run.config.track
+    track = replace(track, view=replace(track.view, turn_share=noise.turn_share))
+    return replace(run, noise=noise, config=replace(run.config, track=track))
 
 
 def each(run: Run, items: Iterable[Item], call: Callable[[Item], Found]) -> dict[Item, Found]:

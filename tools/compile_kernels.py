@@ -30,7 +30,7 @@ MOTION = (V, V, VB, V, V, V, F8, V)
 ROLL = (T, M, M, M, VI, M, M, M, F8, I8, I8, F8)
 KERNELS: dict[tuple[str, str], list[tuple[str, ...]]] = {
     (TRACK, "align_view"): [(M, I8, VI, T, M4, M4, MI, V, V, M, V, M)],
-    (TRACK, "graph_terms"): [(T, MI, M4, M4, MI, V, V, V, "boolean", T, M, T, T, M)],
+    (TRACK, "graph_terms"): [(T, MI, M4, M4, MI, V, V, V, F8, "boolean", T, M, T, T, M)],
     (TRACK, "view_terms"): [(M, I8, VI, T, M4, M4, MI, V, V, V, M, V)],
     (TRACK, "to_object"): [(M, V, M, F8, M, V)],
     (PROFILE, "surface_terms"): [(M4, M, M, V, V, VB, VI, V, F8, F8, M, V, M, M, V)],
@@ -46,7 +46,7 @@ KERNELS: dict[tuple[str, str], list[tuple[str, ...]]] = {
     ("processing.track.registration.consistency_kernels", "consistency_terms"): [
         (T, MI, M4, M4, VI, VI, MI, V, V, V, "boolean", T, M, M)
     ],
-    ("processing.track.flight_kernels", "fit_flights"): [(M, MI, V, V, M4, M4, MI, V, V, M)],
+    ("processing.track.flight_kernels", "fit_flights"): [(M, MI, V, V, M4, M4, MI, V, V, M, F8)],
     ("processing.track.appearance_ratio", "_appearance_at"): [(M4, M, M4, VI, V, V, F8, M)],
     ("processing.contact.physics.steps_cpu", "roll_rows"): [ROLL],
     ("processing.contact.physics.solver_cpu", "solve_rows"): [(T, M, F8, M, F8, I8, F8, I8)],

@@ -66,10 +66,21 @@ class DepthNoise:
     sigma_at_1m: float
     patch_px: float
 
+    @property
+    def turn_share(self) -> float:
+        """Of what depth says of turns, how much counts beside appearance: the variance of a mean over pixels that err
+        alike, that of fine depth in units of this one's."""
+        variance, fine = (n.sigma_at_1m**2 * n.patch_px for n in (self, FINE))
+        return float(np.clip(fine / max(variance, 1e-12), LEAST_TURN_SHARE, 1.0))
+
 
 PUBLISHED = DepthNoise(0.005, 49.0)
 """Where a session shows no table: 2 % at 4 m (D455's data sheet), and matching costs summed over 7x7 pixels (Keselman
 et al., "Intel RealSense Stereoscopic Depth Cameras", CVPR workshops 2017)."""
+FINE = DepthNoise(0.0026, 50.0)
+"""The depth at which the scales of the tracker's schedules were set."""
+LEAST_TURN_SHARE = 0.1
+"""What looks the same from all sides has nothing else to say how it turned."""
 LAG_PX = 24
 """What is alike beyond so many pixels is the table's own form, not the camera's noise."""
 LEAST_TABLE_PX = 5000

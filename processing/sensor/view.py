@@ -54,6 +54,8 @@ class ViewConfig:
     """A view with fewer cannot be tracked."""
     cover_m: float = 0.015
     """What is nearer than the object by this may cover it."""
+    turn_share: float = 1.0
+    """Of what depth says of turns: the rest is the noise of patches that err alike (`DepthNoise.turn_share`)."""
     above_table_m: float = 0.02
     """What is lower above the table than this is the table, which covers nothing."""
 

@@ -163,7 +163,7 @@ def _fitted(
     store = scene.store
     return fit_flights(
         np.ascontiguousarray(starts), pairs, tau, scene.gravity_camera_m_s2, store.maps, store.samples, store.table,
-        store.rectified.focal, store.rectified.center, schedule,
+        store.rectified.focal, store.rectified.center, schedule, store.config.turn_share,
     )  # fmt: skip
 
 

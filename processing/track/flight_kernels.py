@@ -18,7 +18,7 @@ SURE_COST = 0.15
 
 @no_type_check
 @njit(cache=True, nogil=True)
-def fit_flights(starts, pairs, tau, gravity, maps, samples, table, focal, center, schedule):
+def fit_flights(starts, pairs, tau, gravity, maps, samples, table, focal, center, schedule, turn_share):
     """Gauss-Newton from each start (c, UNKNOWNS); returns solutions and the mean cost of their pairs.
 
     pairs (m, 2): views compared; tau (n): time of each view, s. The object frame's origin is the centre of mass.
@@ -36,8 +36,8 @@ def fit_flights(starts, pairs, tau, gravity, maps, samples, table, focal, center
             for _ in range(int(row[STEPS])):
                 for i in used:
                     _place(x, tau[i], gravity, poses[i], J[i])
-                graph_terms(poses, pairs, maps, samples, table, focal, center, row, False, blocks, gradients, none,
-                            none, figures)  # fmt: skip
+                graph_terms(poses, pairs, maps, samples, table, focal, center, row, turn_share, False, blocks,
+                            gradients, none, none, figures)  # fmt: skip
                 H, g = np.zeros((UNKNOWNS, UNKNOWNS)), np.zeros(UNKNOWNS)
                 for m in range(len(pairs)):
                     D = J[pairs[m, 0]] - J[pairs[m, 1]]
@@ -54,8 +54,8 @@ def fit_flights(starts, pairs, tau, gravity, maps, samples, table, focal, center
                     break
         for i in used:
             _place(x, tau[i], gravity, poses[i], J[i])
-        graph_terms(poses, pairs, maps, samples, table, focal, center, schedule[schedule.shape[0] - 1], False, blocks,
-                    gradients, none, none, figures)  # fmt: skip
+        graph_terms(poses, pairs, maps, samples, table, focal, center, schedule[schedule.shape[0] - 1], turn_share,
+                    False, blocks, gradients, none, none, figures)  # fmt: skip
         costs[c] = figures[:, 0].mean()
     return found, costs
 

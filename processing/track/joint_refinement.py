@@ -221,7 +221,7 @@ def _normal_equations(
     crossed, among = k.shading_terms(len(pairs) if shaded else 0)
     k.graph_terms(
         poses, pairs, store.maps, store.samples, store.table, store.rectified.focal, store.rectified.center, row,
-        shaded, blocks, gradients, crossed, among, figures,
+        store.config.turn_share, shaded, blocks, gradients, crossed, among, figures,
     )  # fmt: skip
     if shaded:
         blocks, gradients = eliminated(blocks, gradients, crossed, among)

@@ -57,14 +57,14 @@ ODD_COST = 0.4
 @no_type_check
 @njit(cache=True, nogil=True, fastmath=True)
 def pair_terms(  # noqa: C901
-    samples, step, pose, maps, row, focal, center, level, s_geo, s_int, s_out, round_body, shaded, H, g, B, N
+    samples, step, pose, maps, row, focal, center, level, s_geo, s_int, s_out, round_body, shaded, H, g, Hd, gd, B, N
 ):
     """Adds normal equations of `samples` (of one camera) seen by another view, in that view's camera frame.
 
     pose: 4x4 other_from_sample_camera. H (6, 6), g (6): J^T W J and J^T W r for a twist (translation, rotation) of the
-    points in the other camera's frame. Where `shaded`, B (6, SHADING) and N (SHADING + 1, SHADING) get J^T W K, and
-    K^T W K above r^T W K, for derivatives K by the pair's shading. Returns cost sum, points counted, points on the
-    surface, violations.
+    points in the other camera's frame; Hd, gd: the same of depth (they may be H, g). Where `shaded`, B (6, SHADING)
+    and N (SHADING + 1, SHADING) get J^T W K, and K^T W K above r^T W K, for derivatives K by the pair's shading.
+    Returns cost sum, points counted, points on the surface, violations.
     """
     # long because: one compiled loop over points, the tracker's innermost
     off, u0, v0, w, h = row[OFFSET], row[U0], row[V0], row[WIDTH], row[HEIGHT]
@@ -153,7 +153,7 @@ def pair_terms(  # noqa: C901
                     trust = min(max((trust - GRAZING) / (FACING - GRAZING), 0.0), 1.0)
                     k *= np.sqrt(trust)
                 J[0], J[1], J[2] = nx, ny, nz
-                _add(J, x, y, z, r_m, wg * k * k, H, g)
+                _add(J, x, y, z, r_m, wg * k * k, Hd, gd)
                 cost += 0.5 * min(r * r / 9.0, 1.0)
             elif ahead > 3.0 * s_geo:
                 cost += min(0.5 + ahead / (12.0 * s_geo), 1.0)
@@ -272,7 +272,7 @@ def view_terms(pose, view, refs, ref_poses, maps, samples, table, focal, center,
         h6[:], g6[:] = 0.0, 0.0
         c, s, o, v = pair_terms(
             mine, step, ref_pose @ back, maps, other, focal, center, level, row[GEOMETRY_M], row[INTENSITY],
-            row[OUTLINE_M], row[ROUND] > 0.5, False, h6, g6, none, none,
+            row[OUTLINE_M], row[ROUND] > 0.5, False, h6, g6, h6, g6, none, none,
         )  # fmt: skip
         to_object(h6, g6, ref_pose, 1.0, H, g)
         cost, seen, on, against = cost + c, seen + s, on + o, against + v
@@ -280,7 +280,7 @@ def view_terms(pose, view, refs, ref_poses, maps, samples, table, focal, center,
         h6[:], g6[:] = 0.0, 0.0
         c, s, o, v = pair_terms(
             theirs, 2 * step, pose @ inverse(ref_pose), maps, table[view], focal, center, level, row[GEOMETRY_M],
-            row[INTENSITY], row[OUTLINE_M], row[ROUND] > 0.5, False, h6, g6, none, none,
+            row[INTENSITY], row[OUTLINE_M], row[ROUND] > 0.5, False, h6, g6, h6, g6, none, none,
         )  # fmt: skip
         to_object(h6, g6, pose, -1.0, H, g)
         cost, seen, on, against = cost + c, seen + s, on + o, against + v
@@ -347,26 +347,65 @@ def shading_terms(pairs):
 
 @no_type_check
 @njit(cache=True, nogil=True)
+def _add_depth(Hd, gd, turn_share, H, g):
+    """Adds depth's normal equations (lower triangle): in full as far as a shift of the points answers them, the rest,
+    which is of turns, by `turn_share`.
+
+    Where patches of depth err alike they tilt the surface as a turn would, which every pair shows again, while their
+    mean over the surface is near zero.
+    """
+    full = np.empty((6, 6))
+    for a in range(6):
+        for b in range(a + 1):
+            full[a, b] = Hd[a, b]
+            full[b, a] = Hd[a, b]
+    A = full[:3, :3].copy()
+    least = 1e-6 * (A[0, 0] + A[1, 1] + A[2, 2]) + 1e-12
+    for a in range(3):
+        A[a, a] += least
+    shift = np.linalg.solve(A, np.ascontiguousarray(full[:3]))  # (3, 6): the shift that looks most like a twist
+    H += turn_share * full + (1.0 - turn_share) * (np.ascontiguousarray(full[:, :3]) @ shift)
+    g += turn_share * gd + (1.0 - turn_share) * (np.ascontiguousarray(shift.T) @ gd[:3])
+
+
+@no_type_check
+@njit(cache=True, nogil=True)
 def graph_terms(
-    poses, pairs, maps, samples, table, focal, center, row, shaded, blocks, gradients, crossed, among, figures
+    poses,
+    pairs,
+    maps,
+    samples,
+    table,
+    focal,
+    center,
+    row,
+    turn_share,
+    shaded,
+    blocks,
+    gradients,
+    crossed,
+    among,
+    figures,
 ):
     """Normal equations of each pair (i, k): points of view i in view k.
 
     blocks (m, 6, 6), gradients (m, 6) for the twist of i; that of k has the opposite sign. figures (m, 3): mean cost,
-    share on the surface, share of violations. Where `shaded`, crossed (m, 6, SHADING) and among (m, SHADING + 1,
+    share on the surface, share of violations. turn_share: of what depth says of turns (`ViewConfig.turn_share`). Where
+    `shaded`, crossed (m, 6, SHADING) and among (m, SHADING + 1,
     SHADING) are the pair's B (for the twist of i) and N."""
     level = int(row[LEVEL])
     step = max(1, int(np.round(1.0 / row[SHARE])))
-    h6, g6 = np.empty((6, 6)), np.empty(6)
+    h6, g6, hd, gd = np.empty((6, 6)), np.empty(6), np.empty((6, 6)), np.empty(6)
     b6, n6 = np.zeros((6, SHADING)), np.zeros((SHADING + 1, SHADING))
     for m in range(pairs.shape[0]):
         i, k = pairs[m, 0], pairs[m, 1]
-        h6[:], g6[:], b6[:], n6[:] = 0.0, 0.0, 0.0, 0.0
+        h6[:], g6[:], hd[:], gd[:], b6[:], n6[:] = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         mine = samples[table[i, FIRST] : table[i, FIRST] + table[i, COUNT]]
         c, s, o, v = pair_terms(
             mine, step, poses[k] @ inverse(poses[i]), maps, table[k], focal, center, level, row[GEOMETRY_M],
-            row[INTENSITY], row[OUTLINE_M], row[ROUND] > 0.5, shaded, h6, g6, b6, n6,
+            row[INTENSITY], row[OUTLINE_M], row[ROUND] > 0.5, shaded, h6, g6, hd, gd, b6, n6,
         )  # fmt: skip
+        _add_depth(hd, gd, turn_share, h6, g6)
         blocks[m], gradients[m] = 0.0, 0.0
         to_object(h6, g6, poses[k], 1.0, blocks[m], gradients[m])
         if shaded:

@@ -95,3 +95,14 @@ def test_a_surface_is_one_as_far_as_a_stereo_camera_can_follow_its_slant(
     rays = np.array([1 / focal, 1 / focal, x[0], x[0]])
     fit_surface(depth, np.ones((41, 41), bool), rays, 3, 0.012, out, normals)
     assert (out[20, 20] > 0) == kept
+
+
+@pytest.mark.parametrize(("noise", "share"), [
+    (DepthNoise(0.0026, 50.0), 1.0),  # as fine as the schedules' ...
+    (DepthNoise(0.001, 20.0), 1.0),  # ... finer, which says no more
+    (DepthNoise(0.0052, 50.0), 0.25),
+    (DepthNoise(0.0026, 200.0), 0.25),
+    (DepthNoise(0.02, 300.0), 0.1),
+])  # fmt: skip
+def test_depth_says_less_of_turns_by_the_variance_of_a_patch(noise: DepthNoise, share: float) -> None:
+    assert noise.turn_share == pytest.approx(share, rel=1e-6)

@@ -117,7 +117,7 @@ def _aligned(both: Sides, transform: Float[Array, "4 4"], schedule: Schedule, pa
             figures = np.zeros((len(chosen), 3))
             k.graph_terms(
                 poses, chosen, store.maps, store.samples, store.table, store.rectified.focal, store.rectified.center,
-                row, False, blocks, gradients, *k.shading_terms(0), figures,
+                row, store.config.turn_share, False, blocks, gradients, *k.shading_terms(0), figures,
             )  # fmt: skip
             cost = float(figures[:, 0].mean())
             sign = np.where(np.isin(chosen[:, 0], both.mine), 1.0, -1.0)

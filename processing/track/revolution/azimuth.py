@@ -307,7 +307,7 @@ def standing_terms(
             k.pair_terms(
                 standing[i], 1, poses[j] @ se3.inverse(poses[i]), store.maps, store.table[frames.views[j]],
                 store.rectified.focal, store.rectified.center, 0, config.standing_m, NOT_COMPARED, NOT_COMPARED, False,
-                False, h6, g6, *k.NO_SHADING,
+                False, h6, g6, h6, g6, *k.NO_SHADING,
             )  # fmt: skip
             k.to_object(h6, g6, poses[j], 1.0, full, slope)
             stiff, pull = share * float(axis.twist @ full @ axis.twist), -share * float(axis.twist @ slope)

@@ -55,7 +55,7 @@ def moved(twist):
 def pair(maps, sample, pose=None, level=0, round_body=False):
     H, g = np.zeros((6, 6)), np.zeros(6)
     cost, _, _, _ = k.pair_terms(sample, 1, np.eye(4) if pose is None else pose, maps, ROW, FOCAL, CENTER, level, S_GEO,
-                                 S_INT, S_OUT, round_body, False, H, g, *k.NO_SHADING)  # fmt: skip
+                                 S_INT, S_OUT, round_body, False, H, g, H, g, *k.NO_SHADING)  # fmt: skip
     return cost, H, g
 
 
@@ -77,6 +77,45 @@ def test_a_views_depth_pulls_as_its_truncated_square_with_tukeys_weight(off_m):
     J = np.concatenate([normal, np.cross(sample[0, :3], normal)])
     full = (1 - r * r / 9) ** 2 / S_GEO**2 * np.outer(J, J)
     np.testing.assert_allclose(np.tril(H), np.tril(full), rtol=1e-3, atol=1e-3 * np.abs(full).max())
+
+
+def depth_terms(turn_share, points, normals, off_m):
+    """H, g of depth residuals `off_m` (n) along normals (n, 3) at points (n, 3), as graph_terms adds them."""
+    J = np.concatenate([normals, np.cross(points, normals)], axis=1)
+    H, g = np.zeros((6, 6)), np.zeros(6)
+    k._add_depth(np.tril(J.T @ J), J.T @ off_m, turn_share, H, g)
+    return H, g, J
+
+
+@pytest.fixture
+def curved():
+    """Points of a bowl half a metre away, and their normals."""
+    normals = np.random.default_rng(0).normal(size=(200, 3)) * [0.4, 0.4, 0.1] - [0, 0, 1]
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    return 0.05 * normals + [0.02, -0.01, 0.5] + 0.01 * np.random.default_rng(1).normal(size=(200, 3)), normals
+
+
+def test_depth_that_counts_in_full_adds_its_own_normal_equations(curved):
+    off_m = np.random.default_rng(2).normal(size=200)
+    H, g, J = depth_terms(1.0, *curved, off_m)
+    np.testing.assert_allclose(H, J.T @ J, atol=1e-9 * np.abs(H).max())
+    np.testing.assert_allclose(g, J.T @ off_m, atol=1e-9 * np.abs(g).max())
+
+
+@pytest.mark.parametrize("turn_share", [0.1, 0.5])
+def test_less_of_depths_say_on_turns_leaves_shifts_as_they_are(turn_share, curved):
+    """A residual that a shift answers in full pulls in full, along all six; one that only a turn answers pulls by its
+    share; and information on shifts is the same."""
+    points, normals = curved
+    as_shift = normals @ np.array([0.001, -0.002, 0.003])
+    full, pull, J = depth_terms(1.0, points, normals, as_shift)
+    H, g, _ = depth_terms(turn_share, points, normals, as_shift)
+    np.testing.assert_allclose(g, pull, atol=1e-4 * np.abs(pull).max())
+    np.testing.assert_allclose(H[:3, :3], full[:3, :3], rtol=1e-4, atol=1e-4 * full[0, 0])
+    no_shift = J[:, 3:] @ np.array([0.1, 0.2, -0.1])
+    no_shift -= normals @ np.linalg.lstsq(normals, no_shift, rcond=None)[0]
+    _, g, _ = depth_terms(turn_share, points, normals, no_shift)
+    np.testing.assert_allclose(g[3:], turn_share * (J.T @ no_shift)[3:], rtol=1e-3)
 
 
 @pytest.mark.parametrize("channel", range(lay.APPEARANCE))
@@ -112,7 +151,7 @@ def test_an_appearances_derivative_by_its_shading_is_the_change_of_the_normal():
     sample[0, :3], sample[0, 3:6] = turn[:3, :3].T @ own[0, :3], turn[:3, :3].T @ normal
     sample[0, lay.SSHARP : lay.SSHARP + lay.APPEARANCE] = [0.0, 0.07 * 44.0, 0.0]
     H, g, B, N = np.zeros((6, 6)), np.zeros(6), np.zeros((6, k.SHADING)), np.zeros((k.SHADING + 1, k.SHADING))
-    k.pair_terms(sample, 1, turn, maps, ROW, FOCAL, CENTER, 0, S_GEO, S_INT, S_OUT, False, True, H, g, B, N)
+    k.pair_terms(sample, 1, turn, maps, ROW, FOCAL, CENTER, 0, S_GEO, S_INT, S_OUT, False, True, H, g, H, g, B, N)
     change = sample[0, 3:6] - normal
     np.testing.assert_allclose(N[-1, 3:6] * change[0], N[-1, 3] * change, rtol=1e-5)  # r^T W K is along K ...
     np.testing.assert_allclose(N[3:6, 3:6] / np.trace(N), np.outer(change, change) / (change @ change), rtol=1e-5)

@@ -44,8 +44,8 @@ def said_of_a_turn(paint: float, turned_rad: float, shaded: bool) -> tuple[float
     poses[1] = poses[1] @ se3.exponential(np.array([0, 0, 0, 0, turned_rad, 0]))
     blocks, gradients, figures = np.zeros((1, 6, 6)), np.zeros((1, 6)), np.zeros((1, 3))
     crossed, among = k.shading_terms(1)
-    k.graph_terms(poses, np.array([[0, 1]]), maps, samples, table, FOCAL, CENTER, ROW, shaded, blocks, gradients,
-                  crossed, among, figures)  # fmt: skip
+    k.graph_terms(poses, np.array([[0, 1]]), maps, samples, table, FOCAL, CENTER, ROW, 1.0, shaded, blocks,
+                  gradients, crossed, among, figures)  # fmt: skip
     if shaded:
         blocks, gradients = eliminated(blocks, gradients, crossed, among)
     return float(-gradients[0, 4] / blocks[0, 4, 4]), float(blocks[0, 4, 4])
