@@ -100,9 +100,9 @@ def test_a_surface_is_one_as_far_as_a_stereo_camera_can_follow_its_slant(
 @pytest.mark.parametrize(("noise", "share"), [
     (DepthNoise(0.0026, 50.0), 1.0),  # as fine as the schedules' ...
     (DepthNoise(0.001, 20.0), 1.0),  # ... finer, which says no more
-    (DepthNoise(0.0052, 50.0), 0.25),
-    (DepthNoise(0.0026, 200.0), 0.25),
-    (DepthNoise(0.02, 300.0), 0.1),
+    (DepthNoise(0.0039, 50.0), 1 / 2.25),
+    (DepthNoise(0.0026, 100.0), 0.5),
+    (DepthNoise(0.02, 300.0), 0.3),
 ])  # fmt: skip
 def test_depth_says_less_of_turns_by_the_variance_of_a_patch(noise: DepthNoise, share: float) -> None:
     assert noise.turn_share == pytest.approx(share, rel=1e-6)
