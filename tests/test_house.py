@@ -135,6 +135,8 @@ def test_long_files_and_long_functions_need_a_reason_of_their_own(check):
     long_file = "x = 1\n" * 401
     assert len(list(check.too_long("a.py", long_file))) == 1
     assert not list(check.too_long("a.py", long_file + "# long because: one table\n"))
+    function = "def f():\n    # long because: one loop\n    return 1\n"
+    assert len(list(check.too_long("a.py", long_file + function))) == 1  # a function's reason is not its file's
     long_function = "def f():\n" + "    x = 1\n" * 80
     assert len(list(check.too_long("a.py", long_function + "# long because: not in the function\n"))) == 1
     assert not list(check.too_long("a.py", long_function + "    # long because: one compiled loop\n    x = 2\n"))

@@ -32,3 +32,20 @@ def exponential(twist):
     out[:3, :3] += s * K + c * (K @ K)
     out[:3, 3] = twist[:3]
     return out
+
+
+@no_type_check
+@njit(cache=True, nogil=True)
+def adjoint(pose):
+    """The matrix (6, 6) that turns twists of the frame that a pose comes from into those of the frame it leads to."""
+    A = np.zeros((6, 6))
+    for i in range(3):
+        for j in range(3):
+            A[i, j] = pose[i, j]
+            A[i + 3, j + 3] = pose[i, j]
+    t = pose[:3, 3]
+    for j in range(3):
+        A[0, j + 3] = t[1] * pose[2, j] - t[2] * pose[1, j]
+        A[1, j + 3] = t[2] * pose[0, j] - t[0] * pose[2, j]
+        A[2, j + 3] = t[0] * pose[1, j] - t[1] * pose[0, j]
+    return A

@@ -11,7 +11,7 @@ from typing import no_type_check
 import numpy as np
 from numba import njit
 
-from processing.motion.se3_kernels import exponential, inverse
+from processing.motion.se3_kernels import adjoint, exponential, inverse
 from processing.sensor.view_layout import (
     APPEARANCE,
     COUNT,
@@ -227,7 +227,7 @@ def to_object(H, g, pose, sign, H_out, g_out):
 
     pose: 4x4 camera_from_object. H has its lower triangle only.
     """
-    A = _twist_in_camera(pose)
+    A = adjoint(pose)
     full = np.empty((6, 6))
     for a in range(6):
         for b in range(a + 1):
@@ -235,23 +235,6 @@ def to_object(H, g, pose, sign, H_out, g_out):
             full[b, a] = H[a, b]
     H_out += A.T @ full @ A
     g_out += sign * (A.T @ g)
-
-
-@no_type_check
-@njit(cache=True, nogil=True)
-def _twist_in_camera(pose):
-    """The matrix (6, 6) that turns twists of the object frame into those of the camera frame."""
-    A = np.zeros((6, 6))
-    for i in range(3):
-        for j in range(3):
-            A[i, j] = pose[i, j]
-            A[i + 3, j + 3] = pose[i, j]
-    t = pose[:3, 3]
-    for j in range(3):
-        A[0, j + 3] = t[1] * pose[2, j] - t[2] * pose[1, j]
-        A[1, j + 3] = t[2] * pose[0, j] - t[0] * pose[2, j]
-        A[2, j + 3] = t[0] * pose[1, j] - t[1] * pose[0, j]
-    return A
 
 
 @no_type_check
@@ -409,7 +392,7 @@ def graph_terms(
         blocks[m], gradients[m] = 0.0, 0.0
         to_object(h6, g6, poses[k], 1.0, blocks[m], gradients[m])
         if shaded:
-            crossed[m] = _twist_in_camera(poses[k]).T @ b6
+            crossed[m] = adjoint(poses[k]).T @ b6
             among[m] = n6
         n = max(1, s)
         figures[m, 0], figures[m, 1], figures[m, 2] = c / n, o / n, v / n
