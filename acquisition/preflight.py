@@ -209,18 +209,21 @@ def tags(recorder: Recorder, calibration: RigCalibration) -> Iterator[Row]:
     from calibration.tags.detect import TagDetection, detect_tags
 
     found_in: dict[str, list[TagDetection]] = {}
-    died: set[str] = set()
     for greys in of_one_size(greys_of(recorder)):
         lists = detect_tags(list(greys.values()), calibration.tag_family, jobs=1)
-        found_in |= dict(zip(greys, lists))
-        died |= {list(greys)[k] for k in lists.lost}
+        for k, (topic, found) in enumerate(zip(greys, lists)):
+            if k in lists.lost:
+                yield Row(
+                    "tags", topic.split("/")[1], "warning", "the tag detector died on this picture", "check again"
+                )
+            else:
+                found_in[topic] = found
     for topic, found in found_in.items():
         name = topic.split("/")[1]
         table = {t.tag_id: t for t in calibration.table_tags}
         mine = [t for t in found if t.tag_id in table]
         state: State = "ok" if found else "warning"
-        seen = f"{len(found)} seen, {len(mine)} of the table" if topic not in died else "the tag detector died on it"
-        yield Row("tags", name, state, seen, "light, focus, tags in view")
+        yield Row("tags", name, state, f"{len(found)} seen, {len(mine)} of the table", "light, focus, tags in view")
         off_px = list(_off_px(calibration, name, {t.tag_id: t.corners_px for t in mine}))
         if off_px:
             drift = float(np.median(off_px))

@@ -62,8 +62,7 @@ class D455RefinementConfig:
 class D455Refinement:
     """`off_m`, `off_rad`: how far the D455 stands from its place in the calibration. `corner_px`: median distance of
     its corners from where the mono cameras' poses put them, where those are sure. `offset_s`: what is to be added to
-    the mono cameras' stamps so that the poses of moving frames meet the D455's view, and its standard deviation.
-    `lost_images`: colour images on which the tag detector died."""
+    the mono cameras' stamps so that the poses of moving frames meet the D455's view, and its standard deviation."""
 
     tosses: Mapping[int, TossTruth]
     off_m: float
@@ -72,7 +71,6 @@ class D455Refinement:
     detections: int
     offset_s: float
     offset_std_s: float
-    lost_images: int = 0
 
     @property
     def frames(self) -> int:
@@ -125,19 +123,19 @@ def refine_by_d455(
     limits: TrackedLimits,
     config: D455RefinementConfig,
     progress: Progress,
-) -> D455Refinement | None:
-    """Open poses corrected by what the D455 saw. None where nothing is open, or its place or tags are not known."""
+) -> tuple[D455Refinement | None, int]:
+    """Open poses corrected by what the D455 saw, None where nothing is open, or its place or tags are not known; and on
+    how many of its images the tag detector died."""
     calibration = session.calibration
     wanted = {toss: _wanted(truth, config) for toss, truth in truths.items()}
     if CAMERA not in calibration.cameras or not any(t.open.any() for t in truths.values()):
-        return None
+        return None, 0
     model = calibration.cameras[CAMERA]
     world = calibration.find("world", model.frame)
     if world is None:
-        return None
-    seen, lost_images = _detections(session, wanted, solved, config, progress)
-    own = by_detections(model, np.linalg.inv(world.matrix), seen, truths, limits, config)
-    return own and replace(own, lost_images=lost_images)
+        return None, 0
+    seen, lost = _detections(session, wanted, solved, config, progress)
+    return by_detections(model, np.linalg.inv(world.matrix), seen, truths, limits, config), lost
 
 
 def by_detections(

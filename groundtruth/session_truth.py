@@ -102,18 +102,15 @@ def find_truth(
     )
     size_notes += [f"time offset of the mono cameras applied: {offset_ns / 1e6:.2f} ms"] if offset_ns else []
     truths = {t: at_color_frames(t, session.toss(t).color().times_ns, solved, config.limits) for t in tosses}
-    own = None
+    own, lost = None, 0
     if not config.mono_only:
-        own = refine_by_d455(session, truths, solved, config.limits, D455RefinementConfig(config.family), progress)
+        refinement = D455RefinementConfig(config.family)
+        own, lost = refine_by_d455(session, truths, solved, config.limits, refinement, progress)
+    detections = replace(detections, lost_images=detections.lost_images + lost)
     notes = [*size_notes, *_refinement_notes(truths, own)]
     verdict = judge(solved, detections, spread_ns, notes, calibration)
     if own is not None and (late := _late(own, session)):
         verdict = replace(verdict, warnings=(*verdict.warnings, late))
-    if own is not None and own.lost_images:
-        died = (
-            f"the tag detector died on {own.lost_images} of the D455's images: their poses are the mono cameras' alone"
-        )
-        verdict = replace(verdict, warnings=(*verdict.warnings, died))
     final = {toss: t.without_guesses() for toss, t in (own.tosses if own is not None else truths).items()}
     return SessionTruth(solved, final, verdict, sizes, own)
 

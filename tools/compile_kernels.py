@@ -91,8 +91,13 @@ def side_by_side(modules: list[str], jobs: int) -> Iterator[tuple[str, float]]:
         here.send(waiting.pop())
         busy.append(here)
     while busy:
-        for one in [c for c in busy if c in wait(busy)]:
-            yield one.recv()
+        ready = wait(busy)
+        for one in [c for c in busy if c in ready]:
+            try:
+                done = one.recv()
+            except EOFError:
+                raise SystemExit("a kernel could not be compiled; what went wrong stands above") from None
+            yield done
             if waiting:
                 one.send(waiting.pop())
             else:

@@ -80,8 +80,8 @@ et al., "Intel RealSense Stereoscopic Depth Cameras", CVPR workshops 2017)."""
 FINE = DepthNoise(0.0026, 50.0)
 """The depth at which the scales of the tracker's schedules were set."""
 LEAST_TURN_SHARE = 0.3
-"""No less: what looks the same from all sides has little else to say how it turned. Chosen on ten rendered sessions of
-the variety: rotations gain as much as at .1 to .15, and positions do not lose."""
+"""No less: what looks the same from all sides has little else to say how it turned. Ten rendered sessions of the
+variety do not tell .1 from .3."""
 LAG_PX = 24
 """What is alike beyond so many pixels is the table's own form, not the camera's noise."""
 LEAST_TABLE_PX = 5000

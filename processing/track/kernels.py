@@ -354,28 +354,15 @@ def _add_depth(Hd, gd, turn_share, H, g):
 @no_type_check
 @njit(cache=True, nogil=True)
 def graph_terms(
-    poses,
-    pairs,
-    maps,
-    samples,
-    table,
-    focal,
-    center,
-    row,
-    turn_share,
-    shaded,
-    blocks,
-    gradients,
-    crossed,
-    among,
+    poses, pairs, maps, samples, table, focal, center, row, turn_share, shaded, blocks, gradients, crossed, among,
     figures,
-):
+):  # fmt: skip
     """Normal equations of each pair (i, k): points of view i in view k.
 
-    blocks (m, 6, 6), gradients (m, 6) for the twist of i; that of k has the opposite sign. figures (m, 3): mean cost,
-    share on the surface, share of violations. turn_share: of what depth says of turns (`ViewConfig.turn_share`). Where
-    `shaded`, crossed (m, 6, SHADING) and among (m, SHADING + 1,
-    SHADING) are the pair's B (for the twist of i) and N."""
+    turn_share: of what depth says of turns (`ViewConfig.turn_share`). blocks (m, 6, 6), gradients (m, 6) for the twist
+    of i; that of k has the opposite sign. figures (m, 3): mean cost, share on the surface, share of violations. Where
+    `shaded`, crossed (m, 6, SHADING) and among (m, SHADING + 1, SHADING) are the pair's B (for the twist of i) and N.
+    """
     level = int(row[LEVEL])
     step = max(1, int(np.round(1.0 / row[SHARE])))
     h6, g6, hd, gd = np.empty((6, 6)), np.empty(6), np.empty((6, 6)), np.empty(6)

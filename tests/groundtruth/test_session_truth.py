@@ -140,6 +140,12 @@ def test_stamps_of_one_trigger_that_differ_a_little_are_one_instant_and_it_is_sa
     assert any("differ by up to 0.30 ms" in w for w in verdict.warnings)
 
 
+def test_images_on_which_the_tag_detector_died_are_counted_in_the_verdict(made):
+    assert not any("died" in w for w in solved(made)[1].warnings)
+    _, verdict = solved(replace(made, detections=replace(made.detections, lost_images=3)))
+    assert any("the tag detector died on 3 images" in w for w in verdict.warnings)
+
+
 def test_a_bumped_camera_is_named_with_its_toss(toss_lab):
     bump = Transform("camera", "camera", Rotation.from_rotvec([0.0, 0.01, 0]).as_matrix(), np.array([0.006, 0, 0]))
     bumped = toss_lab(tosses=3, frames=12, bumped=("mono1", 2, bump))

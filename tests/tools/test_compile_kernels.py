@@ -1,8 +1,10 @@
 """What set-up compiles is all that there is to compile."""
 
 import ast
-import importlib.util
+import importlib
 from pathlib import Path
+
+import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -14,10 +16,20 @@ def decorated(tree):
             yield node
 
 
-def test_every_kernel_is_compiled_ahead_or_called_by_one_that_is():
-    found = importlib.util.spec_from_file_location("compile_kernels", ROOT / "tools" / "compile_kernels.py")
-    tool = importlib.util.module_from_spec(found)
-    found.loader.exec_module(tool)
+@pytest.fixture
+def tool(monkeypatch):
+    """As a module that processes of its own can import."""
+    monkeypatch.syspath_prepend(str(ROOT / "tools"))
+    return importlib.import_module("compile_kernels")
+
+
+def test_a_kernel_that_does_not_compile_ends_set_up_with_a_sentence(tool, capfd):
+    with pytest.raises(SystemExit, match="could not be compiled"):
+        list(tool.side_by_side(["processing.motion.se3_kernels", "processing.no_such_kernels"], jobs=2))
+    assert "no_such_kernels" in capfd.readouterr().err
+
+
+def test_every_kernel_is_compiled_ahead_or_called_by_one_that_is(tool):
     kernels, called = set(), set()
     for path in (p for package in ("processing", "recordings") for p in (ROOT / package).rglob("*.py")):
         if "njit" not in (text := path.read_text()):
