@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Float32, Int
 from numpy import ndarray as Array
 
 from processing.features.sift import lifted
-from processing.sensor.view import ViewStore
+from processing.sensor.view_store import ViewStore
 from recordings.constants import LUMA
 from recordings.errors import BadInput
 

@@ -15,7 +15,7 @@ from numpy import ndarray as Array
 from processing.features.learned import PictureConfig, no_pairs, open_kornia, picture_of, points_under
 from processing.features.sift import Features
 from processing.published_weights import LIGHTGLUE, check_layers, find_weights, read_weights
-from processing.sensor.view import ViewStore
+from processing.sensor.view_store import ViewStore
 from recordings.errors import BadInput
 
 

@@ -14,7 +14,8 @@ from jaxtyping import Float, Float32, Int
 from numpy import ndarray as Array
 
 from processing.sensor import view_layout as lay
-from processing.sensor.view import Crop, ViewStore
+from processing.sensor.view import Crop
+from processing.sensor.view_store import ViewStore
 from recordings.constants import LUMA
 from recordings.geometry import rigid_fit
 

@@ -4,7 +4,8 @@
 segment. The numbers here are asked before that, or of two or three frames alone. They differ because what they guard
 differs, and because each was set on its own data; one law may take their place. Elsewhere stay:
 
-- `sensor/still.py`, `sensor/view.py` (STILL_*): whether images changed, in grey levels and pixels, before any pose;
+- `sensor/still.py`, `sensor/view_store.py` (STILL_*): whether images changed, in grey levels and pixels,
+  before any pose;
 - `segment/detect/`, `track/flight.py`: whether a thing without a pose falls, in metres of what is seen of it;
 - `track/joint_refinement.py`, `smoother.py` (FLIGHT_CHANGE_*, also of the forecasts): standard deviations of
   residuals, no decisions;

@@ -17,7 +17,7 @@ from processing.track.track_file import read_toss_track
 from recordings.results.folder import write_track
 from recordings.tracks import ObjectTrack
 
-VERSION = 8
+VERSION = 9
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from numpy import ndarray as Array
 from processing.motion import se3_kernels as se3
 from processing.sensor import noise
 from processing.sensor import view_layout as lay
-from processing.sensor.view import ViewStore
+from processing.sensor.view_store import ViewStore
 from processing.track.beam import Scene
 from processing.track.schedule import USUAL_DISTANCE_M
 from recordings.constants import MAD_TO_SIGMA_SHORT

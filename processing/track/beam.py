@@ -19,7 +19,7 @@ from processing.motion import se3_kernels as se3
 from processing.motion.interpolate import carried_on, moved, turn_between
 from processing.motion.motion_prior import MotionConfig, change_cost, steady_spin
 from processing.motion.rotation_grid import turn_grid
-from processing.sensor.view import ViewStore
+from processing.sensor.view_store import ViewStore
 from processing.track import kernels as k
 from processing.track.keyframes import KeyframeConfig, is_new, references
 from processing.track.schedule import Schedule, rows
@@ -36,9 +36,9 @@ class BeamConfig:
     """Hypotheses kept."""
     branches: int = 3
     """Candidates of one hypothesis that may live on."""
-    coarse: Schedule = ((1, 6, 0.012, 0.5, 0.010, 0.15), (1, 4, 0.006, 0.4, 0.008, 0.3))
-    fine: Schedule = ((0, 5, 0.004, 0.4, 0.006, 0.4), (0, 6, 0.0025, 0.3, 0.005, 1.0))
-    grid: Schedule = ((1, 5, 0.012, 0.5, 0.010, 0.1),)
+    coarse: Schedule = ((1, 6, 0.012, 0.25, 0.010, 0.15), (1, 4, 0.006, 0.2, 0.008, 0.3))
+    fine: Schedule = ((0, 5, 0.004, 0.2, 0.006, 0.4), (0, 6, 0.0025, 0.15, 0.005, 1.0))
+    grid: Schedule = ((1, 5, 0.012, 0.25, 0.010, 0.1),)
     uncertain_cost: float = 0.07
     """A frame whose best fit costs more asks for feature matches."""
     search: float = 0.13

@@ -13,7 +13,7 @@ from numpy import ndarray as Array
 from processing.motion.interpolate import between
 from processing.sensor import noise
 from processing.sensor import view_layout as lay
-from processing.sensor.view import ViewStore
+from processing.sensor.view_store import ViewStore
 from processing.track.beam import Scene
 from recordings.geometry import rotation_log, skew
 from recordings.tracks import Status

@@ -19,7 +19,7 @@ from processing.motion import se3_kernels as se3
 from processing.motion.interpolate import turn_between
 from processing.motion.motion_prior import free_change_rad_s, free_jerk_rad_s
 from processing.sensor import noise
-from processing.sensor.view import ViewStore
+from processing.sensor.view_store import ViewStore
 from processing.track import kernels as k
 from processing.track.keyframes import view_directions
 from processing.track.schedule import Schedule, rows

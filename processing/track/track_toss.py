@@ -17,7 +17,8 @@ from processing.motion.motion_prior import gravity_in_camera
 from processing.sensor import view_layout as lay
 from processing.sensor.photometric_gain import PhotometricGain
 from processing.sensor.rectification import Rectification
-from processing.sensor.view import Crop, ViewConfig, ViewStore, cut
+from processing.sensor.view import Crop, ViewConfig, cut
+from processing.sensor.view_store import ViewStore
 from processing.track.beam import BeamConfig, Candidate, Hypothesis, Scene, follow, started
 from processing.track.depth_color_offset import unknown_motion
 from processing.track.flags import (
@@ -33,6 +34,7 @@ from processing.track.flight import FlightConfig, flights_followed, flying
 from processing.track.hypotheses import HypothesisConfig, TrajectoryHypothesis, anchored_to, apart_deg, select
 from processing.track.keyframes import is_new
 from processing.track.known_shape import ShapeConfig, ShapeViews, center_of, located, shape_views
+from processing.track.windows import WindowConfig, through_windows
 from recordings.errors import BadInput
 from recordings.geometry import CameraModel, Transform
 from recordings.progress import Progress, Silent
@@ -49,6 +51,7 @@ class TrackConfig:
 
     view: ViewConfig = field(default_factory=ViewConfig)
     beam: BeamConfig = field(default_factory=BeamConfig)
+    windows: WindowConfig = field(default_factory=WindowConfig)
     hypotheses: HypothesisConfig = field(default_factory=HypothesisConfig)
     flags: FlagConfig = field(default_factory=FlagConfig)
     shape: ShapeConfig = field(default_factory=ShapeConfig)
@@ -232,6 +235,7 @@ def views_of(
     store = ViewStore(rectified, [*crops, *(drawn.crops if drawn else ())], config.view)
     for i in range(len(store)):
         store.fill(i)
+    store.take_light_out(len(frames))
     return store, (np.array(times_ns) - times_ns[0]) * 1e-9, drawn
 
 
@@ -283,6 +287,8 @@ def _followed(
         if all(apart_deg(best.poses[:n], s.poses[:n]) > config.separate_deg for s in hypotheses):
             hypotheses.append(best)
         hypotheses += _through_flights(scene, first, best, hypotheses, narrow, config)
+        so_far = [best, *hypotheses]
+        hypotheses += through_windows(scene, first, so_far, config.beam.keyframes, config.windows, config.hypotheses)
     out = []
     for hypothesis in hypotheses:
         if any(scene.store.usable(i) for i in range(first)):

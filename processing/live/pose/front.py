@@ -23,7 +23,8 @@ from processing.sensor import view_layout as lay
 from processing.sensor.frames import corrected_depth
 from processing.sensor.noise import TRACK_COVARIANCE_SCALE, stereo_sigma_m
 from processing.sensor.rectification import Rectification
-from processing.sensor.view import Crop, ViewConfig, ViewStore, cut
+from processing.sensor.view import Crop, ViewConfig, cut
+from processing.sensor.view_store import ViewStore
 from processing.track.beam import BeamConfig, Hypothesis, Scene, follow
 from processing.track.known_shape import ShapeConfig, center_of, located, shape_views
 from recordings.geometry import CameraModel, Transform, skew

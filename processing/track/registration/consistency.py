@@ -17,7 +17,7 @@ from numpy import ndarray as Array
 
 from processing.motion.rotation_grid import all_turns
 from processing.sensor import view_layout as lay
-from processing.sensor.view import ViewStore
+from processing.sensor.view_store import ViewStore
 from processing.track import kernels as k
 from processing.track.joint_refinement import add_pairs
 from processing.track.keyframes import view_directions

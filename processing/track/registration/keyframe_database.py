@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 from numpy import ndarray as Array
 
 from processing.sensor import view_layout as lay
-from processing.sensor.view import ViewStore
+from processing.sensor.view_store import ViewStore
 from processing.track.keyframes import view_directions
 from processing.track.known_shape import ShapeConfig, center_of, shape_views
 from processing.track.registration.support_plane import SupportPlane, SupportPlaneConfig, support_plane

@@ -17,7 +17,7 @@ from numpy import ndarray as Array
 from processing.motion import se3_kernels as se3
 from processing.motion.interpolate import turn_between
 from processing.sensor import view_layout as lay
-from processing.sensor.view import ViewStore
+from processing.sensor.view_store import ViewStore
 from processing.track.revolution.unwrapping import table_of
 from recordings.robust import tukey_weight
 

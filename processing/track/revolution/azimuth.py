@@ -18,7 +18,7 @@ from scipy.ndimage import minimum_filter1d
 
 from processing.motion import se3_kernels as se3
 from processing.sensor import noise
-from processing.sensor.view import ViewStore
+from processing.sensor.view_store import ViewStore
 from processing.track import kernels as k
 from processing.track.beam import Scene
 from processing.track.revolution import azimuth_kernels as tk

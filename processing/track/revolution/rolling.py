@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int
 from numpy import ndarray as Array
 
-from processing.sensor.view import ViewStore
+from processing.sensor.view_store import ViewStore
 from processing.track.revolution.axis import Axis
 from processing.track.revolution.unwrapping import across, table_of
 

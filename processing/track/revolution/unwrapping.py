@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Float32, Int
 from numpy import ndarray as Array
 
 from processing.sensor import view_layout as lay
-from processing.sensor.view import ViewStore
+from processing.sensor.view_store import ViewStore
 from processing.track.beam import Scene
 from processing.track.revolution.axis import Axis
 from recordings.constants import LUMA, MAD_TO_SIGMA_SHORT

@@ -10,7 +10,8 @@ import pytest
 from processing.features.sift import Sift
 from processing.sensor import view_layout as lay
 from processing.sensor.rectification import Rectification
-from processing.sensor.view import Crop, ViewConfig, ViewStore
+from processing.sensor.view import Crop, ViewConfig
+from processing.sensor.view_store import ViewStore
 from processing.track.beam import Scene
 from processing.track.revolution import azimuth_kernels as tk
 from processing.track.revolution.axis import Axis, AxisConfig, open_axis

@@ -13,7 +13,8 @@ from numpy import ndarray as Array
 from processing.features.sift import Sift
 from processing.motion import se3_kernels as se3
 from processing.sensor.rectification import Rectification
-from processing.sensor.view import ViewConfig, ViewStore
+from processing.sensor.view import ViewConfig
+from processing.sensor.view_store import ViewStore
 from processing.track.keyframes import view_directions
 from processing.track.known_shape import ShapeConfig, shape_views
 from processing.track.registration.consistency import ConsistencyConfig, ConsistencyTerms, Inconsistency, Rims

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from processing.sensor import view_layout as lay
-from processing.sensor.view import ViewStore
+from processing.sensor.view_store import ViewStore
 from processing.track.flags import FlagConfig, contradicting, unjoined, unjoined_uncertainty
 from recordings.geometry import rotation_exp
 

@@ -17,7 +17,8 @@ from processing.features.loftr import Grid, Loftr, LoftrConfig
 from processing.features.sift import FeatureMatcher, Features, RansacConfig, Sift, relative_motions
 from processing.features.xfeat import XFeat, XFeatConfig
 from processing.sensor.rectification import Rectification
-from processing.sensor.view import ViewConfig, ViewStore, cut
+from processing.sensor.view import ViewConfig, cut
+from processing.sensor.view_store import ViewStore
 from processing.track.beam import Candidate
 from processing.track.notes import NotesConfig, notes_of
 from processing.track.track_toss import TossTrack

@@ -9,7 +9,8 @@ from processing.features.sift import Sift
 from processing.motion import se3_kernels as se3
 from processing.sensor import view_layout as lay
 from processing.sensor.rectification import Rectification
-from processing.sensor.view import Crop, ViewConfig, ViewStore
+from processing.sensor.view import Crop, ViewConfig
+from processing.sensor.view_store import ViewStore
 from processing.track.beam import Scene
 from processing.track.revolution import profile_kernels as rk
 from processing.track.revolution.axis import Axis

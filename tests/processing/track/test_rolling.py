@@ -9,7 +9,7 @@ import pytest
 from numpy import ndarray as Array
 
 from processing.features.sift import Sift
-from processing.sensor.view import ViewStore
+from processing.sensor.view_store import ViewStore
 from processing.track.beam import Scene
 from processing.track.revolution.axis import Axis
 from processing.track.revolution.azimuth_smoothing import SteadyConfig, _carried

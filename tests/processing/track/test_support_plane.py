@@ -11,7 +11,7 @@ from numpy import ndarray as Array
 
 from processing.motion import se3_kernels as se3
 from processing.sensor import view_layout as lay
-from processing.sensor.view import ViewStore
+from processing.sensor.view_store import ViewStore
 from processing.track.registration.support_plane import SupportPlane, SupportPlaneConfig, support_plane
 from recordings.geometry import rotation_exp
 

@@ -25,7 +25,8 @@ from processing.motion.rotation_grid import all_turns
 from processing.sensor import view_layout as lay
 from processing.sensor.rectification import Rectification
 from processing.sensor.surface_kernel import fit_surface
-from processing.sensor.view import ViewConfig, ViewStore, cut, make_view
+from processing.sensor.view import ViewConfig, cut, make_view
+from processing.sensor.view_store import ViewStore
 from processing.track import hypotheses as trajectory
 from processing.track.center_of_mass import flight_center
 from processing.track.flags import camera_covariance

@@ -1,0 +1,99 @@
+"""Short windows linked through an impact, from hypotheses that are both wrong; the cheapest path of known motions."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy import ndarray as Array
+
+from processing.features.sift import Sift
+from processing.motion.motion_prior import gravity_in_camera
+from processing.track.beam import Hypothesis, Scene
+from processing.track.track_toss import TrackConfig, first_pose, started, views_of
+from processing.track.windows import WindowConfig, _distinct, _poses, through_windows
+from recordings.geometry import Transform, rotation_angle_rad, rotation_exp
+from recordings.progress import Silent
+
+STEP_S = 1 / 30
+FRAMES, IMPACT = 13, 6
+BEFORE, AFTER = np.array([6.0, -9.0, 7.0]), np.array([-5.0, -2.0, 8.0])
+"""Spins of 24 and 18 degrees a frame."""
+
+
+def thrown(i: int) -> Transform:
+    """world_from_object: spins one way until the impact, another way after it, and moves across the table."""
+    t, t0 = i * STEP_S, IMPACT * STEP_S
+    turn = rotation_exp(BEFORE * min(t, t0))
+    if t > t0:
+        turn = rotation_exp(AFTER * (t - t0)) @ turn
+    place = np.array([-0.08, -0.05, 0.14 + 0.3 * abs(t - t0)]) + np.array([0.4, 0.2, 0.0]) * t
+    return Transform("world", "object", turn @ rotation_exp(np.array([0.7, 0.5, 0.3])), place)
+
+
+@pytest.fixture(scope="module")
+def scene(tiny_world: Any) -> Scene:
+    seen = [tiny_world.see(thrown(i), i) for i in range(FRAMES)]
+    frames = [replace(f, time_ns=round(i * STEP_S * 1e9), depth_time_ns=round(i * STEP_S * 1e9))
+              for i, (f, _) in enumerate(seen)]  # fmt: skip
+    store, times_s, _ = views_of(
+        frames, [m for _, m in seen], tiny_world.camera, np.ones(FRAMES), TrackConfig(), tiny_world.world_from_camera,
+        Silent(),
+    )  # fmt: skip
+    gravity = gravity_in_camera(tiny_world.world_from_camera.matrix)
+    return Scene(store, times_s, gravity, np.array([0.0, 0.0, 0.03]), Sift())
+
+
+def sliding(scene: Scene, spin: Array) -> Hypothesis:
+    """A trajectory that follows the cloud and turns steadily (rad/s, camera axes), whatever the images show."""
+    h = started(scene.store, FRAMES, 0, first_pose(scene.store, 0))
+    poses = np.tile(h.poses[0], (FRAMES, 1, 1))
+    for i, pose in enumerate(poses):
+        pose[:3, :3] = rotation_exp(spin * i * STEP_S) @ pose[:3, :3]
+        pose[:3, 3] += scene.store.center_m[i] - scene.store.center_m[0]
+    return replace(h, poses=poses, done=tuple(range(FRAMES)))
+
+
+def test_windows_find_both_spins_of_an_impact_that_no_hypothesis_has(scene: Scene, tiny_world: Any) -> None:
+    wrong = [sliding(scene, np.zeros(3)), sliding(scene, np.array([0.0, 4.0, 0.0]))]
+    config = TrackConfig()
+    (found,) = through_windows(scene, 0, wrong, config.beam.keyframes, config.windows, config.hypotheses)
+    camera = tiny_world.world_from_camera.rotation
+    np.testing.assert_array_equal(found.poses[0], wrong[0].poses[0])
+    for i in range(1, FRAMES):
+        turn = found.poses[i, :3, :3] @ found.poses[0, :3, :3].T
+        true = camera.T @ thrown(i).rotation @ thrown(0).rotation.T @ camera
+        assert np.degrees(rotation_angle_rad(turn @ true.T)) < 6.0
+    assert len(found.keyframes) > 1
+
+
+def test_where_all_hypotheses_agree_nothing_is_left_open(scene: Scene) -> None:
+    same, config = sliding(scene, np.zeros(3)), TrackConfig()
+    for hypotheses in ([same], [same, same]):
+        assert through_windows(scene, 0, hypotheses, config.beam.keyframes, config.windows, config.hypotheses) == []
+
+
+def test_too_few_frames_make_no_window(scene: Scene) -> None:
+    wrong, config = [sliding(scene, np.zeros(3)), sliding(scene, np.array([0.0, 4.0, 0.0]))], TrackConfig()
+    more = replace(config.windows, frames=FRAMES + 1)
+    assert through_windows(scene, 0, wrong, config.beam.keyframes, more, config.hypotheses) == []
+
+
+def test_motions_that_move_the_body_alike_are_one() -> None:
+    center, step, far = np.array([0.0, 0.0, 0.8]), np.eye(4), np.eye(4)
+    step[:3, 3], far[:3, :3] = [0.0005, 0, 0], rotation_exp(np.array([0.0, 0.1, 0]))
+    assert len(_distinct([np.eye(4), step, far], center, WindowConfig())) == 2
+
+
+def test_linked_motions_pass_through_the_given_pose_and_leave_other_frames_out() -> None:
+    steps = [np.eye(4), np.eye(4)]
+    steps[0][0, 3], steps[1][:3, :3] = 0.1, rotation_exp(np.array([0.0, 0, 0.5]))
+    pose = np.eye(4)
+    pose[2, 3] = 0.9
+    out = _poses(steps, np.array([0, 2, 3]), 2, pose, 5)
+    np.testing.assert_array_equal(out[2], pose)
+    np.testing.assert_allclose(steps[0] @ out[0], pose)
+    np.testing.assert_allclose(out[3], steps[1] @ pose)
+    assert np.isnan(out[[1, 4]]).all()
