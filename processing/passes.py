@@ -70,8 +70,11 @@ def comparison(run: Run, before: Pass, after: Pass, images: Mapping[int, Images]
         judged = each(run, of.halves, lambda half: judge_by_contact(run, name, of.tracks, half))
         return losses_of([*judged.values()])
 
-    was, now = both(run, lambda: explained(before), lambda: explained(after))
-    contact = both(run, lambda: contact_j(before), lambda: contact_j(after))
+    (was, now), contact = both(
+        run,
+        lambda: both(run, lambda: explained(before), lambda: explained(after)),
+        lambda: both(run, lambda: contact_j(before), lambda: contact_j(after)),
+    )
     shares = [now[k] / was[k] - 1 for k in ("depth_m", "mask", "color") if was[k] and now[k] is not None]
     if all(contact):
         shares.append(certain_share(*contact))

@@ -45,6 +45,7 @@ class LightGlue:
     """FeatureMatcher by LightGlue on SIFT. See `FeatureMatcher`; it matches what it described itself."""
 
     name = "lightglue"
+    side_by_side = False
 
     def __init__(self, network: Any, config: LightGlueConfig | None = None, device: str = "cpu") -> None:
         self.config = config or LightGlueConfig()

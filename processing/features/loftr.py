@@ -55,6 +55,7 @@ class Loftr:
     """FeatureMatcher by LoFTR. See `FeatureMatcher`; it matches what it described itself."""
 
     name = "loftr"
+    side_by_side = False
 
     def __init__(self, network: Any, config: LoftrConfig | None = None, device: str = "cpu") -> None:
         self.config = config or LoftrConfig()

@@ -30,9 +30,11 @@ class Features:
 
 @runtime_checkable
 class FeatureMatcher(Protocol):
-    """Finds and matches feature points on the object. One class per backend."""
+    """Finds and matches feature points on the object. One class per backend. `side_by_side`: several threads may
+    match at a time."""
 
     name: str
+    side_by_side: bool
 
     def describe(self, store: ViewStore, view: int) -> Features:
         """Feature points of a view that have depth."""
@@ -60,6 +62,7 @@ class Sift:
     """Scale-invariant feature transform (Lowe 2004), from OpenCV."""
 
     name = "sift"
+    side_by_side = True
 
     def __init__(self, config: SiftConfig | None = None) -> None:
         self.config = config or SiftConfig()

@@ -32,6 +32,7 @@ class XFeat:
     """FeatureMatcher by XFeat. See `FeatureMatcher`."""
 
     name = "xfeat"
+    side_by_side = False
 
     def __init__(self, network: Any, config: XFeatConfig | None = None, device: str = "cpu") -> None:
         self.config = config or XFeatConfig()

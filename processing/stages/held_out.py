@@ -13,6 +13,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from jaxtyping import Float
+from numpy import ndarray as Array
 from scipy.optimize import minimize_scalar
 
 from processing.run import CAMERA, Run
@@ -102,9 +104,9 @@ def judge_by_contact(run: Run, name: str, tracks: Mapping[int, Done], half: Half
         )
         world_from_camera = run.session.calibration.transform("world", CAMERA)
         try:
-            shape, model = read_shape(half.shape.folder), read_contact(learned.folder)
-            raised_m = best_height_m(own, shape, model, world_from_camera)
-            losses = losses_at(raised_m, others, shape, model, world_from_camera)
+            points_m, model = hull_of(read_shape(half.shape.folder)), read_contact(learned.folder)
+            raised_m = best_height_m(own, points_m, model, world_from_camera)
+            losses = losses_at(raised_m, others, points_m, model, world_from_camera)
         except BadInput as why:
             return HeldOutResult({}, kept_out=str(why))
         write_json(folder / "losses.json", {str(t): asdict(x) for t, x in losses.items()})
@@ -114,30 +116,37 @@ def judge_by_contact(run: Run, name: str, tracks: Mapping[int, Done], half: Half
 
 
 def best_height_m(
-    poses: Mapping[int, ObjectTrack], shape: ObjectShape, model: ContactModel, world_from_camera: Transform
+    poses: Mapping[int, ObjectTrack], points_m: Float[Array, "v 3"], model: ContactModel, world_from_camera: Transform
 ) -> float:
     """How far (m) the plane is raised where the mean loss of these tosses is least."""
     from processing.contact.learn.shape_comparison import mean_loss_j
 
     def mean_j(raised_m: float) -> float:
-        return mean_loss_j(losses_at(raised_m, poses, shape, model, world_from_camera))
+        return mean_loss_j(losses_at(raised_m, poses, points_m, model, world_from_camera))
 
     return float(minimize_scalar(mean_j, bounds=HEIGHTS_M, method="bounded", options={"xatol": 2e-4}).x)
+
+
+def hull_of(shape: ObjectShape) -> Float[Array, "v 3"]:
+    """The points of a shape that may touch: the same at every height of the plane."""
+    from processing.contact.physics.support import trimmed_hull
+
+    return trimmed_hull(shape.vertices_m, shape.faces)
 
 
 def losses_at(
     raised_m: float,
     poses: Mapping[int, ObjectTrack],
-    shape: ObjectShape,
+    points_m: Float[Array, "v 3"],
     model: ContactModel,
     world_from_camera: Transform,
 ) -> dict[int, TossLoss]:
     """Contact losses above the plane raised by so much (m)."""
-    from processing.contact.learn.shape_comparison import contact_loss_of
+    from processing.contact.learn.shape_comparison import contact_loss_by
     from processing.contact.physics.plane import Plane
 
     plane = Plane(model.plane_normal_world, model.plane_offset_m + float(raised_m), "the contact model")
-    return contact_loss_of(poses, shape, model, world_from_camera, plane)
+    return contact_loss_by(poses, points_m, model, world_from_camera, plane)
 
 
 def _listed(tosses: Sequence[int]) -> str:

@@ -22,8 +22,8 @@ from processing.sensor import noise
 from processing.sensor.view_store import ViewStore
 from processing.track import kernels as k
 from processing.track.keyframes import view_directions
+from processing.track.pairs import compared
 from processing.track.schedule import Schedule, rows
-from processing.track.shading import eliminated
 from recordings.geometry import rotation_log, skew
 from recordings.robust import geman_mcclure_weight
 
@@ -215,16 +215,7 @@ def _normal_equations(
     priors: Sequence[Terms],
 ) -> tuple[Float[Array, "f f"], Float[Array, " f"], Float[Array, "m 3"]]:  # fmt: skip
     count = int(place.max()) + 1
-    blocks, gradients = np.zeros((len(pairs), 6, 6)), np.zeros((len(pairs), 6))
-    figures = np.zeros((len(pairs), 3))
-    shaded = not config.round_body
-    crossed, among = k.shading_terms(len(pairs) if shaded else 0)
-    k.graph_terms(
-        poses, pairs, store.maps, store.samples, store.table, store.rectified.focal, store.rectified.center, row,
-        store.config.turn_share, shaded, blocks, gradients, crossed, among, figures,
-    )  # fmt: skip
-    if shaded:
-        blocks, gradients = eliminated(blocks, gradients, crossed, among)
+    blocks, gradients, figures = compared(store, poses, pairs, row, shaded=not config.round_body)
     weight = 1.0 / (1.0 + (figures[:, 0] / config.sure_cost) ** 2) / config.shared_noise
     blocks *= weight[:, None, None]
     gradients *= weight[:, None]

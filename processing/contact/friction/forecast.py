@@ -114,6 +114,7 @@ class Forecasts:
             for c, f in zip(trajectories, first)
         ]
         self._scale_m: Float[Array, "n k"] | None = None
+        self._known: dict[Law, Float[Array, " n"]] = {}
 
     def _before_impact(self, trajectory: ObservedTrajectory) -> list[Float[Array, "1 s ..."]]:
         """Members of the state at the last frame of the flight, from all frames up to it."""
@@ -130,11 +131,14 @@ class Forecasts:
 
     def scores(self, laws: Sequence[Law]) -> Float[Array, "m n"]:
         """The energy score of every law and toss: the sum over frames, each in units of how far off forecasts of it
-        are on average (over the laws that were asked for first, for all the same)."""
-        energy, off = self.energies(laws)
-        if self._scale_m is None:
-            self._scale_m = np.maximum(off.mean(0), self.noise.position_m)
-        return (energy / self._scale_m).sum(2)
+        are on average (over the laws that were asked for first, for all the same). A law is rolled out once."""
+        new = [law for law in dict.fromkeys(laws) if law not in self._known]
+        if new:
+            energy, off = self.energies(new)
+            if self._scale_m is None:
+                self._scale_m = np.maximum(off.mean(0), self.noise.position_m)
+            self._known |= dict(zip(new, (energy / self._scale_m).sum(2)))
+        return np.array([self._known[law] for law in laws])
 
     def energies(self, wanted: Sequence[Law]) -> tuple[Float[Array, "m n k"], Float[Array, "m n k"]]:
         """Energy score and mean distance in metres, per law, toss and frame; 0 where a toss has ended."""

@@ -65,9 +65,21 @@ def contact_loss_of(
     `shape` None: the model's own support points. Lower is better; compare tosses that neither was learned from.
     Raises BadInput where no toss can be used.
     """
+    points = model.support_vertices_m if shape is None else trimmed_hull(shape.vertices_m, shape.faces)
+    return contact_loss_by(tracks, points, model, world_from_camera, plane, weights)
+
+
+def contact_loss_by(
+    tracks: Mapping[int, ObjectTrack],
+    points: Float[Array, "v 3"],
+    model: ContactModel,
+    world_from_camera: Transform,
+    plane: Plane | None = None,
+    weights: Weights = JUDGING,
+) -> dict[int, TossLoss]:
+    """The same by the points (object frame) that may touch."""
     plane = plane or Plane(model.plane_normal_world, model.plane_offset_m, "the contact model")
     frame = Frame(np.eye(3), model.center_of_mass_m)
-    points = model.support_vertices_m if shape is None else trimmed_hull(shape.vertices_m, shape.faces)
     prepared = prepare(series_of(tracks, world_from_camera), frame, plane, _scaled(model))
     return losses_of(prepared, frame.inside(points), model.friction, _scaled(model), weights)
 

@@ -9,12 +9,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 from numpy import ndarray as Array
 
+from processing.engine.parts import in_parts
 from processing.motion.rotation_grid import all_turns
 from processing.sensor import view_layout as lay
 from processing.sensor.view_store import ViewStore
@@ -53,6 +55,8 @@ class ConsistencyConfig:
     """... and finely."""
 
 
+PART = 64
+"""Pairs of views that are compared in one part of the work."""
 RIM_POINTS = 200
 RIM_REACH_PX = 4.0
 """A pixel of the outline takes the plane of the nearest good depth within this reach."""
@@ -284,8 +288,12 @@ def _compared(
         (rims.points_m, rims.first, rims.count, True),
     ):
         H, g, figures = np.zeros((n, 6, 6)), np.zeros((n, 6)), np.zeros((n, c.FIGURES))
-        c.consistency_terms(poses, pairs, store.maps, points, first, count, store.table, store.rectified.focal,
-                            store.rectified.center, row, rim, H, g, figures)  # fmt: skip
+        data = (store.maps, points, first, count, store.table, store.rectified.focal, store.rectified.center, row, rim)
+
+        def compare(some: slice, data: tuple[Any, ...] = data, out: tuple[Any, ...] = (H, g, figures)) -> None:
+            c.consistency_terms(poses, pairs[some], *data, *(values[some] for values in out))
+
+        in_parts(compare, n, PART)
         blocks, gradients = blocks + H, gradients + g
         total.append(figures.sum(0))
     return blocks, gradients, np.concatenate(total)

@@ -9,10 +9,12 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray as Array
 
+from processing.engine.parts import in_parts
 from processing.features.sift import FeatureMatcher, Features, RansacConfig, relative_motions
 from processing.motion import se3_kernels as se3
 from processing.track import kernels as k
 from processing.track.keyframes import view_directions
+from processing.track.pairs import compared
 from processing.track.registration.keyframe_database import Sides
 from processing.track.schedule import Schedule, rows
 
@@ -81,13 +83,18 @@ def _proposed(
     for i in (*both.mine, *both.theirs):
         if int(i) not in features:
             features[int(i)] = matcher.describe(both.keyframes.store, int(i))
-    found: list[tuple[float, Float[Array, "4 4"]]] = []
-    for i in both.mine:
-        for j in both.theirs:
-            for m in relative_motions(matcher, features[int(i)], features[int(j)], config.ransac, seed=int(i), most=1):
-                transform = np.linalg.inv(both.common[j]) @ m.other_from_one @ both.keyframes.poses[i]
-                found.append((float(m.inliers), transform))
-    return _voted(found, config.tried)
+
+    def moved(some: slice) -> list[tuple[float, Float[Array, "4 4"]]]:
+        """By the matches of some views of the toss with all views of the others."""
+        return [
+            (float(m.inliers), np.linalg.inv(both.common[j]) @ m.other_from_one @ both.keyframes.poses[i])
+            for i in both.mine[some]
+            for j in both.theirs
+            for m in relative_motions(matcher, features[int(i)], features[int(j)], config.ransac, seed=int(i), most=1)
+        ]
+
+    found = in_parts(moved, len(both.mine), 1) if matcher.side_by_side else [moved(slice(None))]
+    return _voted([f for part in found for f in part], config.tried)
 
 
 def _voted(found: list[tuple[float, Float[Array, "4 4"]]], most: int) -> tuple[list[Float[Array, "4 4"]], list[float]]:
@@ -113,12 +120,7 @@ def _aligned(both: Sides, transform: Float[Array, "4 4"], schedule: Schedule, pa
             chosen = _facing_pairs(both, poses, pairs, config)
             if len(chosen) == 0:
                 return Fit(transform, np.inf)
-            blocks, gradients = np.zeros((len(chosen), 6, 6)), np.zeros((len(chosen), 6))
-            figures = np.zeros((len(chosen), 3))
-            k.graph_terms(
-                poses, chosen, store.maps, store.samples, store.table, store.rectified.focal, store.rectified.center,
-                row, store.config.turn_share, False, blocks, gradients, *k.shading_terms(0), figures,
-            )  # fmt: skip
+            blocks, gradients, figures = compared(store, poses, chosen, row, shaded=False)
             cost = float(figures[:, 0].mean())
             sign = np.where(np.isin(chosen[:, 0], both.mine), 1.0, -1.0)
             transform = stepped(transform, blocks.sum(0), (sign[:, None] * gradients).sum(0))

@@ -51,6 +51,19 @@ def test_of_frictions_at_30_hz_under_noise_the_true_one_forecasts_best(simulated
     assert found.sum(1).argmin() == 2
 
 
+def test_a_law_is_rolled_out_once_and_scores_the_same_in_any_company(simulated_tosses, rigid_box, monkeypatch):
+    tosses = [t.part(slice(0, 40, 5)) for t in simulated_tosses(2, 130)]
+    trajectories = [ObservedTrajectory(t.time_s, t.rotation, t.position_m, 3) for t in tosses]
+    forecasts, fresh = (Forecasts(trajectories, rigid_box, Noise(1e-3, np.radians(0.5))) for _ in range(2))
+    slow, fast = Law(0.2, 0.1, 0.05), Law(0.3, 0.0, 0.05)
+    first = forecasts.scores([slow, fast])
+    np.testing.assert_array_equal(fresh.scores([slow, fast]), first)
+    alone = fresh.energies([fast])[0] / fresh._scale_m
+    np.testing.assert_array_equal(alone.sum(2), first[1:])
+    monkeypatch.setattr(forecasts, "energies", lambda laws: pytest.fail("rolled out again"))
+    np.testing.assert_array_equal(forecasts.scores([fast, slow, fast]), first[[1, 0, 1]])
+
+
 def test_forecasts_and_rollouts_call_the_kernel_with_one_signature(simulated_tosses, rigid_box, box_body, monkeypatch):
     """Every further one is compiled anew, which takes ten seconds."""
     signatures = set()

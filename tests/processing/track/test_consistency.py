@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from numpy import ndarray as Array
 
+from processing.engine.parts import allow_threads
 from processing.features.sift import Sift
 from processing.motion import se3_kernels as se3
 from processing.sensor.rectification import Rectification
@@ -17,12 +18,13 @@ from processing.sensor.view import ViewConfig
 from processing.sensor.view_store import ViewStore
 from processing.track.keyframes import view_directions
 from processing.track.known_shape import ShapeConfig, shape_views
-from processing.track.registration.consistency import ConsistencyConfig, ConsistencyTerms, Inconsistency, Rims
+from processing.track.registration.consistency import PART, ConsistencyConfig, ConsistencyTerms, Inconsistency, Rims
 from processing.track.registration.consistency import _against as against
 from processing.track.registration.keyframe_database import KeyframeDatabase, far_apart, sides
-from processing.track.registration.proposals import Fit, distinct
+from processing.track.registration.proposals import Fit, ProposeConfig, by_features, distinct
 from processing.track.registration.register import RegisterConfig, _placed, _Placing
 from processing.track.registration.support_plane import SupportPlane, SupportPlaneConfig
+from processing.track.schedule import rows
 from recordings.geometry import CameraModel, rotation_exp
 from recordings.progress import Silent
 from recordings.tracks import ObjectShape
@@ -117,6 +119,21 @@ def test_a_small_error_of_place_is_taken_back() -> None:
     off[:3, 3] += [0.008, -0.006, 0.005]
     found = both.fitted([Fit(off, 0.0)])
     assert turned_deg(found[0]) < 1.0
+
+
+def test_two_threads_compare_views_and_match_features_to_the_same_bytes_as_one() -> None:
+    found = []
+    for threads in (1, 2):
+        allow_threads(threads)
+        try:
+            against = inconsistency(prism(SLENDER, 0.166, None), apart=False)
+            terms = against._terms(against.both.poses(np.eye(4)), against.pairs, rows(CONFIG.fine, 1.0)[0])
+            proposed, sure = by_features(against.both, {}, Sift(), ProposeConfig())
+        finally:
+            allow_threads(1)
+        found.append((*(x.tobytes() for x in terms), [(p.first_from_own.tobytes(), p.cost) for p in proposed], sure))
+    assert len(against.pairs) > PART
+    assert found[0] == found[1]
 
 
 def test_rim_points_lie_on_the_outline() -> None:
