@@ -7,7 +7,7 @@ from jaxtyping import Float, Int
 from numpy import ndarray as Array
 
 from processing.engine.parts import in_parts
-from processing.sensor.view import ViewStore
+from processing.sensor.view_store import ViewStore
 from processing.track import kernels as k
 from processing.track.shading import eliminated
 
