@@ -36,9 +36,9 @@ class BeamConfig:
     """Hypotheses kept."""
     branches: int = 3
     """Candidates of one hypothesis that may live on."""
-    coarse: Schedule = ((1, 6, 0.012, 0.25, 0.010, 0.15), (1, 4, 0.006, 0.2, 0.008, 0.3))
+    coarse: Schedule = ((1, 6, 0.012, 0.5, 0.010, 0.15), (1, 4, 0.006, 0.4, 0.008, 0.3))
     fine: Schedule = ((0, 5, 0.004, 0.2, 0.006, 0.4), (0, 6, 0.0025, 0.15, 0.005, 1.0))
-    grid: Schedule = ((1, 5, 0.012, 0.25, 0.010, 0.1),)
+    grid: Schedule = ((1, 5, 0.012, 0.5, 0.010, 0.1),)
     uncertain_cost: float = 0.07
     """A frame whose best fit costs more asks for feature matches."""
     search: float = 0.13
