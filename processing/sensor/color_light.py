@@ -25,10 +25,8 @@ USUAL_CONTRAST = 0.14
 the scales of alignment were set (cube_dev's box and lab_dev's prism: .12 and .14)."""
 MOST_GAIN = 4.0
 """Colours are raised at most so many times: a camera's noise (.003 to .03 in these units) stays below the scales."""
-LIGHT_SIGMA = 0.1
-"""Standard deviation of the light's coefficients before anything is seen: about half the usual contrast."""
-PATCHES = 16.0
-"""A view's paint varies in about so many patches: its samples are no more independent measurements of the light."""
+LIGHT_SIGMA = 0.04
+"""Standard deviation of the light's coefficients before anything is seen: lamps and tables are nearly white."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,9 +44,9 @@ class ColorLight:
         return ColorLight(np.zeros((ORDERS, lay.APPEARANCE - 1)), np.zeros(ORDERS), gain)
 
     @staticmethod
-    def of(samples: Sequence[Float32[Array, "s c"]]) -> ColorLight:
-        """The light on the samples of some views (`view_layout`), each of another pose; each view counts as much as
-        the others."""
+    def of(samples: Sequence[Float32[Array, "_ c"]]) -> ColorLight:
+        """The light on the samples of some views (`view_layout`), each of another pose. A view is one measurement of
+        it, off by its paint: its samples show few patches, and the next view shows most of them again."""
         seen = [view[_colors(view, lay.SSHARP, 1)[:, 0] < 0.5 * lay.NO_APPEARANCE] for view in samples]
         seen = [own for own in seen if len(own)]
         if not seen:
@@ -63,8 +61,8 @@ class ColorLight:
         precision = np.eye(ORDERS) / LIGHT_SIGMA**2
         pull = np.zeros((ORDERS, lay.APPEARANCE - 1))
         for b, c in zip(basis, colors, strict=True):
-            precision += PATCHES / paint * (b - usual).T @ (b - usual) / len(b)
-            pull += PATCHES / paint * (b - usual).T @ (c - middle) / len(b)
+            precision += (b - usual).T @ (b - usual) / len(b) / paint
+            pull += (b - usual).T @ (c - middle) / len(b) / paint
         coefficients = np.linalg.solve(precision, pull)
         left = [(c - (b - usual) @ coefficients).var(0) for b, c in zip(basis, colors, strict=True)]
         contrast = float(np.sqrt(np.median(left, axis=0).mean()))
