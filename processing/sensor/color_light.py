@@ -20,9 +20,9 @@ from processing.sensor import view_layout as lay
 
 ORDERS = 8
 """Functions of the normal: three of first and five of second order."""
-USUAL_CONTRAST = 0.14
+USUAL_CONTRAST = 0.12
 """Root mean square of the differences of colour about their means (in the units of the views' appearance) for which
-the scales of alignment were set (cube_dev's box and lab_dev's prism: .12 and .14)."""
+the scales of alignment were set: that of cube_dev's box."""
 MOST_GAIN = 4.0
 """Colours are raised at most so many times: a camera's noise (.003 to .03 in these units) stays below the scales."""
 LIGHT_SIGMA = 0.04
