@@ -21,7 +21,7 @@ from processing.motion.motion_prior import MotionConfig, change_cost, steady_spi
 from processing.motion.rotation_grid import turn_grid
 from processing.sensor.view_store import ViewStore
 from processing.track import kernels as k
-from processing.track.keyframes import KeyframeConfig, is_new, references
+from processing.track.keyframes import KeyframeConfig, extended, references
 from processing.track.schedule import Schedule, rows
 
 LEAST_DELAY_S = 0.0003
@@ -203,9 +203,7 @@ def _extended(h: Hypothesis, i: int, c: Candidate, scene: Scene, config: BeamCon
         return replace(h, done=(*h.done, i), total=h.total + config.lost + 0.1)
     poses, costs, on = h.poses.copy(), h.costs.copy(), h.on_surface.copy()
     poses[i], costs[i], on[i] = c.pose, c.fit, c.on_surface
-    keys = h.keyframes
-    if i not in keys and is_new(poses, i, keys, scene.center_m, config.keyframes):
-        keys = (*keys, i)
+    keys = extended(h.keyframes, poses, (i,), scene.center_m, config.keyframes)
     return Hypothesis(poses, costs, on, (*h.done, i), keys, h.total + c.cost)
 
 

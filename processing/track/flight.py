@@ -18,7 +18,7 @@ from processing.sensor import view_layout as lay
 from processing.track.appearance_ratio import turns_apart_deg
 from processing.track.beam import BeamConfig, Hypothesis, Scene, follow
 from processing.track.flight_kernels import SPIN, VELOCITY, fit_flights
-from processing.track.keyframes import is_new
+from processing.track.keyframes import extended
 from processing.track.schedule import Schedule, rows
 from recordings.geometry import rotation_exp
 
@@ -218,9 +218,7 @@ def _followed(scene: Scene, flight: Flight, first: int, beam: BeamConfig) -> Hyp
     n, frames = len(scene.times_s), tuple(int(i) for i in flight.frames)
     poses, costs, on = np.full((n, 4, 4), np.nan), np.full(n, np.nan), np.full(n, np.nan)
     poses[flight.frames], costs[flight.frames], on[flight.frames] = flight.poses, flight.cost, 1.0
-    keys: tuple[int, ...] = (frames[0],)
-    for i in frames[1:]:
-        keys = (*keys, i) if is_new(poses, i, keys, scene.center_m, beam.keyframes) else keys
+    keys = extended(frames[:1], poses, frames, scene.center_m, beam.keyframes)
     h = Hypothesis(poses, costs, on, frames[::-1], keys, 0.0)
     h = follow(scene, np.arange(frames[0] - 1, first - 1, -1), [h], beam).best
     return follow(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -36,7 +37,21 @@ def rotations_deg(poses: Float[Array, "n 4 4"], pose: Float[Array, "4 4"]) -> Fl
     return np.asarray(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
 
 
-def is_new(
+def extended(
+    keyframes: tuple[int, ...],
+    poses: Float[Array, "n 4 4"],
+    views: Sequence[int],
+    center_m: Float[Array, "3"],
+    config: KeyframeConfig,
+) -> tuple[int, ...]:
+    """The keyframes and, one after the other, those of the views that show what none before them shows."""
+    for i in views:
+        if i not in keyframes and _is_new(poses, i, keyframes, center_m, config):
+            keyframes = (*keyframes, i)
+    return keyframes
+
+
+def _is_new(
     poses: Float[Array, "n 4 4"],
     view: int,
     keyframes: tuple[int, ...],

@@ -32,7 +32,7 @@ from processing.track.flags import (
 )
 from processing.track.flight import FlightConfig, flights_followed, flying
 from processing.track.hypotheses import HypothesisConfig, TrajectoryHypothesis, anchored_to, apart_deg, select
-from processing.track.keyframes import is_new
+from processing.track.keyframes import extended
 from processing.track.known_shape import ShapeConfig, ShapeViews, center_of, located, shape_views
 from processing.track.windows import WindowConfig, through_windows
 from recordings.errors import BadInput
@@ -349,9 +349,7 @@ def _filled_in(
     h = Hypothesis(poses, np.full(n, np.nan), np.full(n, np.nan), tuple(given), (given[0],), 0.0)
     if known.model is not None:
         h = _with_model(h, known.model)
-    for i in given[1:]:
-        if is_new(h.poses, i, h.keyframes, scene.center_m, config.beam.keyframes):
-            h = replace(h, keyframes=(*h.keyframes, i))
+    h = replace(h, keyframes=extended(h.keyframes, h.poses, given, scene.center_m, config.beam.keyframes))
     rejected: dict[int, list[Candidate]] = {}
     for i in range(n):
         if i in given or not scene.store.usable(i):

@@ -21,7 +21,8 @@ from processing.track import kernels as k
 from processing.track.beam import Hypothesis, Scene
 from processing.track.flight import FlightConfig, solved
 from processing.track.hypotheses import HypothesisConfig, TrajectoryHypothesis, apart_deg, refined
-from processing.track.keyframes import KeyframeConfig, is_new
+from processing.track.keyframes import KeyframeConfig, extended
+from processing.track.pairs import compared
 from processing.track.schedule import Schedule, rows
 
 Motions = list[Float[Array, "4 4"]]
@@ -71,8 +72,9 @@ def through_windows(
     found: list[TrajectoryHypothesis] = []
     for _ in range(config.rounds):
         poses = _poses(_linked(scene, usable, steps, config), usable, first, best.poses[first], n)
-        linked = Hypothesis(poses, np.full(n, np.nan), np.full(n, np.nan), tuple(range(n)), (first,), 0.0)
-        found.append(refined(scene, _with_keyframes(linked, scene, usable, keyframes), first, True, refinement))
+        keys = extended((first,), poses, usable.tolist(), scene.center_m, keyframes)
+        linked = Hypothesis(poses, np.full(n, np.nan), np.full(n, np.nan), tuple(range(n)), keys, 0.0)
+        found.append(refined(scene, linked, first, True, refinement))
         _remember(steps, found[-1].joint.poses, usable, still)
     chosen = min(found, key=lambda h: h.cost)
     return [replace(chosen.estimated, poses=chosen.joint.poses)]
@@ -179,17 +181,12 @@ def _changes_deg(ones: Motions, twos: Motions, spans_s: Float[Array, "2"]) -> Fl
 
 def _pair_costs(scene: Scene, i: int, j: int, motions: Motions, row: Float[Array, "7"]) -> Float[Array, " m"]:
     """Mean cost of two views, both ways, under each motion from one to the other."""
-    store, pairs = scene.store, np.array([[i, j], [j, i]], dtype=np.int64)
+    pairs = np.array([[i, j], [j, i]], dtype=np.int64)
     poses = np.zeros((max(i, j) + 1, 4, 4))
     poses[i] = np.eye(4)
-    blocks, gradients, figures = np.zeros((2, 6, 6)), np.zeros((2, 6)), np.zeros((2, 3))
-    none, out = np.empty((0, 0, 0)), np.empty(len(motions))
+    out = np.empty(len(motions))
     for m, poses[j] in enumerate(motions):
-        k.graph_terms(
-            poses, pairs, store.maps, store.samples, store.table, store.rectified.focal, store.rectified.center, row,
-            store.config.turn_share, False, blocks, gradients, none, none, figures,
-        )  # fmt: skip
-        out[m] = figures[:, 0].mean()
+        out[m] = compared(scene.store, poses, pairs, row, shaded=False)[2][:, 0].mean()
     return out
 
 
@@ -204,10 +201,3 @@ def _poses(
     for a in range(at - 1, -1, -1):
         out[usable[a]] = se3.inverse(motions[a]) @ out[usable[a + 1]]
     return out
-
-
-def _with_keyframes(h: Hypothesis, scene: Scene, usable: Int[Array, " u"], config: KeyframeConfig) -> Hypothesis:
-    for i in map(int, usable):
-        if i not in h.keyframes and is_new(h.poses, i, h.keyframes, scene.center_m, config):
-            h = replace(h, keyframes=(*h.keyframes, i))
-    return h
