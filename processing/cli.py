@@ -279,9 +279,9 @@ def _vision(args: argparse.Namespace, engine: Engine, session: Session, name: st
     """Every row that was asked for."""
     from processing.engine.each import InTurn
     from processing.engine.workers import Shown
-    from processing.pipeline import process
+    from processing.pipeline.process import process
+    from processing.pipeline.start import start_run, with_table
     from processing.run import each
-    from processing.start import start_run, with_table
 
     model = None if args.model is None else learned_shape_of(args.model)
     tosses = chosen_tosses(args.toss, session.tosses, "--toss")
@@ -336,7 +336,7 @@ def _evaluate(args: argparse.Namespace, session: Session, out: Path, run: Run) -
     from processing.evaluate.score import score_variant, true_mesh
     from processing.evaluate.table import collect, markdown, write_table
     from processing.evaluate.truth import open_truth
-    from processing.pipeline import metric_frames_of
+    from processing.pipeline.process import metric_frames_of
     from processing.store import locked
     from recordings.results.folder import Results
 

@@ -29,8 +29,8 @@ from processing.config import Config
 from processing.evaluate.score import VariantScore, score_variant
 from processing.evaluate.table import COLUMNS
 from processing.evaluate.truth import open_truth
-from processing.pipeline import process
-from processing.start import start_run
+from processing.pipeline.process import process
+from processing.pipeline.start import start_run
 from processing.variants import BEYOND, TABLE, find_variant
 from recordings.importers.folder import import_folder
 from recordings.progress import Silent

@@ -111,9 +111,9 @@ def bench_pose(session: Path, learn: int, tosses: int) -> bool:
         made = list(looks(session, learn + tosses, Path(place)))
         looker, together = made[-1][1], made[-1][2]
         shape = _shape_of(together, learn)
-        assert looker.scene is not None
-        assert looker.rig is not None
-        background, scale = StaticScene.read(looker.scene.folder), Rig.read(looker.rig.folder).depth_scale
+        assert looker.shared is not None
+        background = StaticScene.read(looker.shared.scene.folder)
+        scale = Rig.read(looker.shared.rig.folder).depth_scale
     within, cpu_ms, lost = list[bool](), list[float](), 0
     with Session.open(session) as opened:
         calibration = opened.calibration

@@ -21,7 +21,7 @@ from processing.engine.outcome import Lost, Outcome, outcome_of
 from processing.engine.parts import allow_threads
 from recordings.progress import Board, Progress, Silent
 
-PRELOADED = ["processing.pipeline"]
+PRELOADED = ["processing.pipeline.process"]
 """Imported once, in the process that all workers are forked from (where there is such a one)."""
 REPORT_EVERY_S = 0.2
 

@@ -245,9 +245,9 @@ class _Follower:
 
     def _write_scene(self) -> None:
         """What the live pose needs beside the shape."""
-        if self.looker.scene is not None and self.looker.rig is not None:
-            StaticScene.read(self.looker.scene.folder).write(self.writer.folder)
-            scale = Rig.read(self.looker.rig.folder).depth_scale
+        if self.looker.shared is not None:
+            StaticScene.read(self.looker.shared.scene.folder).write(self.writer.folder)
+            scale = Rig.read(self.looker.shared.rig.folder).depth_scale
             write_json(self.writer.folder / "front.json", {"depth_scale": scale})
 
     def _forget(self, toss: int, why: str) -> None:

@@ -12,28 +12,19 @@ from processing.backends import matcher_of
 from processing.config import Config
 from processing.field.learn import TossViews, chosen_views
 from processing.field.views import FieldView
-from processing.images import TossImages, raw_images
+from processing.images import TossImages
 from processing.live.config import LiveConfig, light
 from processing.live.so_far import SessionSoFar
 from processing.live.verdict import Seen, what_is_seen
 from processing.live.watch import FileId
-from processing.run import CAMERA, Run
-from processing.sensor.still import Kept, ThinnedSession
-from processing.stages.find import find_object
-from processing.stages.lose import without_lost
-from processing.stages.recording.rig import RigResult, refine_rig
-from processing.stages.recording.scene import SceneResult, learn_static_scene
-from processing.stages.recording.still import without_waiting
-from processing.stages.segment import segment
-from processing.store import Done, Store
+from processing.pipeline.one_toss import Shared, Step, masked, thrown_frames
+from processing.run import Run
+from processing.store import Store
 from processing.track.track_toss import TossTrack, track_toss
 from recordings.errors import BadInput
 from recordings.progress import Progress
 from recordings.records import TossWindow
 from recordings.session import Session
-
-Step = Callable[[str], None]
-"""Told before each step; raises what ends the work (the toss was taken away)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,8 +50,7 @@ class Looker:
     config: Config
     live: LiveConfig
     progress: Callable[[str], Progress]
-    scene: Done[SceneResult] | None = None
-    rig: Done[RigResult] | None = None
+    shared: Shared | None = None
     learned_from: tuple[int, ...] = ()
     files: dict[int, FileId] = field(default_factory=dict)
 
@@ -71,14 +61,12 @@ class Looker:
         try:
             run = self._run(session, (toss,))
             step("scene")
-            scene, rig = self._shared(run)
-            run = thrown_frames(run, toss, self.live)
-            step("masks")
-            found = find_object(run, scene, rig)
-            masks = segment(run, toss, scene, rig, found)
-            run = without_lost(run, {toss: masks})
+            if self.shared is None:
+                self.shared, self.learned_from = Shared.of(run), run.recorded
+            live = self.live
+            run = thrown_frames(run, toss, live.before_release_s, live.after_rest_s, live.least_thrown)
+            run, images = masked(run, toss, self.shared, step)
             step("track")
-            images = raw_images(run, toss, rig, masks).open()
             tracked = _track(run, toss, images)
             step("what is seen")
             seen = what_is_seen(images.frames, list(images.masks), self.live)
@@ -88,11 +76,12 @@ class Looker:
             session.close()
 
     def learn_scene_again(self, tosses: tuple[int, ...]) -> None:
-        """The static scene from more tosses."""
+        """The static scene from more tosses, once one was looked at."""
+        if self.shared is None:
+            return
         session = self._open(tosses)
         try:
-            self.scene = learn_static_scene(self._run(session, tosses))
-            self.learned_from = tosses
+            self.shared, self.learned_from = self.shared.with_scene_of(self._run(session, tosses)), tosses
         finally:
             session.close()
 
@@ -109,35 +98,12 @@ class Looker:
         store = Store(self.scratch)
         return Run(session, tosses, store, light(self.config), "live", "cpu", self.progress, keys)
 
-    def _shared(self, run: Run) -> tuple[Done[SceneResult], Done[RigResult]]:
-        if self.scene is None or self.rig is None:
-            scene = learn_static_scene(run)
-            self.rig, self.scene, self.learned_from = refine_rig(run, scene), scene, run.recorded
-        return self.scene, self.rig
-
     def _views(self, run: Run, tracked: TossTrack, images: TossImages) -> tuple[FieldView, ...]:
         seen: TossViews = images.views(tracked.track)
         try:
             return tuple(chosen_views([seen], run.camera, replace(run.config.shape, most_views=self.live.field_views)))
         except BadInput:
             return ()
-
-
-def thrown_frames(run: Run, toss: int, live: LiveConfig) -> Run:
-    """The run with the frames from shortly before the release until the rest, where the recorder has seen both; else
-    with few frames of every still stretch, as the pipeline has it."""
-    recorded = run.session.toss(toss)
-    window, times_ns = recorded.window(), recorded.rgbd(CAMERA).times_ns
-    if window.release_time_ns is None or window.rest_time_ns is None:
-        return without_waiting(run)
-    first = np.searchsorted(times_ns, window.release_time_ns - round(live.before_release_s * 1e9))
-    last = np.searchsorted(times_ns, window.rest_time_ns + round(live.after_rest_s * 1e9))
-    positions = np.arange(first, min(int(last), len(times_ns)), dtype=np.int64)
-    if len(positions) < live.least_thrown:
-        return without_waiting(run)
-    like = np.clip(np.arange(len(times_ns)) - int(first), 0, len(positions) - 1)
-    kept = {toss: Kept(positions, like)}
-    return replace(run, session=ThinnedSession(run.session, kept), kept=kept)
 
 
 def _track(run: Run, toss: int, images: TossImages) -> TossTrack:

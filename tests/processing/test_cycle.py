@@ -16,13 +16,13 @@ from processing.config import Config
 from processing.evaluate.table import said
 from processing.field.learn import LearnConfig
 from processing.field.train import FieldConfig
-from processing.passes import Pass
+from processing.pipeline.passes import Pass
+from processing.pipeline.start import start_run
 from processing.refine.icp import IcpConfig, ShapeSurface, align_frame
 from processing.refine.image_residuals import JudgeConfig, ShapeDrawer, explain
 from processing.refine.redrawn_frames import RedrawConfig, SecondFrames, redraw
 from processing.sensor.render import RaycastRenderer
 from processing.stages.place import placement
-from processing.start import start_run
 from processing.variants import TRACKERS, find_variant
 from recordings.geometry import rotation_exp
 from recordings.notices import Notice
@@ -229,7 +229,7 @@ def test_contact_without_the_cycle_leaves_the_poses_as_vision_had_them(
 def test_passes_go_on_while_the_raw_images_are_explained_better_and_the_best_is_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from processing import cycle
+    from processing.pipeline import cycle
 
     judged = iter([0.001, -0.02, -0.01, 0.0005])
     count = iter(range(2, 9))

@@ -17,17 +17,17 @@ import numpy as np
 import pytest
 import trimesh
 
-from processing import cycle
 from processing.cli import config_of, main
 from processing.config import Config
 from processing.field.learn import LearnConfig
 from processing.field.train import FieldConfig
-from processing.passes import Pass, pose_change
+from processing.pipeline import cycle
+from processing.pipeline.passes import Pass, pose_change
+from processing.pipeline.start import start_run
 from processing.refine.image_residuals import SLACK_M, Explained, JudgeConfig, difference, explain
 from processing.run import Run
 from processing.stages.contact import ContactResult, learn_contact
 from processing.stages.judge import JudgeResult
-from processing.start import start_run
 from processing.store import Done, Store
 from recordings.progress import Silent
 from recordings.results.folder import Results, read_shape, write_shape, write_track

@@ -317,8 +317,8 @@ from processing.engine.each import InTurn, SideBySide
 from processing.engine.workers import Shown, Worker
 from processing.field.learn import LearnConfig
 from processing.field.train import FieldConfig
-from processing.pipeline import process
-from processing.start import start_run
+from processing.pipeline.process import process
+from processing.pipeline.start import start_run
 from processing.variants import find_variant
 from recordings.progress import Board
 from recordings.session import Session

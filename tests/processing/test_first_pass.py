@@ -9,15 +9,15 @@ import cv2
 import numpy as np
 import pytest
 
-from processing import first_pass
 from processing.config import Config
-from processing.first_pass import _left, kept_apart
 from processing.images import Images, TossImages
+from processing.pipeline import first_pass
+from processing.pipeline.first_pass import _left, kept_apart
+from processing.pipeline.start import start_run
 from processing.run import Run
 from processing.stages.fuse import fuse_frames
 from processing.stages.register import RegisterResult
 from processing.stages.track import TrackResult
-from processing.start import start_run
 from processing.store import Done
 from recordings.geometry import rotation_exp
 from recordings.progress import Silent

@@ -11,12 +11,13 @@ import pytest
 import trimesh
 
 from processing.config import Config
-from processing.cycle import learned_by_halves, second_pass, with_contact
 from processing.evaluate.truth import open_truth
 from processing.field.learn import LearnConfig
 from processing.field.train import FieldConfig
 from processing.images import raw_images
-from processing.passes import Pass, certain_share
+from processing.pipeline.cycle import learned_by_halves, second_pass, with_contact
+from processing.pipeline.passes import Pass, certain_share
+from processing.pipeline.start import start_run
 from processing.run import Run
 from processing.stages.contact import learn_contact
 from processing.stages.find import find_object
@@ -24,7 +25,6 @@ from processing.stages.held_out import Half, halves_of, judge_by_contact, losses
 from processing.stages.recording.rig import refine_rig
 from processing.stages.recording.scene import learn_static_scene
 from processing.stages.segment import segment
-from processing.start import start_run
 from processing.store import Done
 from recordings.progress import Silent
 from recordings.results.folder import read_shape, read_track, write_shape, write_track

@@ -20,7 +20,7 @@ from processing.evaluate.floor import coverage_floor
 from processing.evaluate.score import VariantScore, score_variant
 from processing.evaluate.table import collect, markdown, table_document
 from processing.evaluate.truth import Truth
-from processing.start import start_run
+from processing.pipeline.start import start_run
 from recordings.exporters.export import export
 from recordings.geometry import CameraModel, rotation_exp
 from recordings.progress import Silent

@@ -14,13 +14,13 @@ import cv2
 import numpy as np
 import pytest
 
-from processing import stage_notices
 from processing.cli import config_of, main
 from processing.config import CycleConfig
 from processing.contact.report.result import left_out_notice
 from processing.evaluate.table import summary
 from processing.field.learn import LearnConfig
 from processing.field.train import FieldConfig
+from processing.pipeline import notices
 from processing.run import Run
 from processing.sensor.noise import PUBLISHED
 from processing.stages.recording.noise import NoiseResult
@@ -52,7 +52,7 @@ def masks_of(others_moving: int = 0, without_depth: int = 0) -> Done[SegmentResu
 
 def test_depth_that_errs_by_far_more_than_the_data_sheet_says_is_told_with_its_size() -> None:
     def of(sigma: float, frames: int = 3) -> list[Notice]:
-        return stage_notices.of_noise(done(NoiseResult(frames, sigma, 40.0)))
+        return notices.of_noise(done(NoiseResult(frames, sigma, 40.0)))
 
     assert not of(1.9 * PUBLISHED.sigma_at_1m)
     assert not of(PUBLISHED.sigma_at_1m, frames=0)
@@ -61,8 +61,8 @@ def test_depth_that_errs_by_far_more_than_the_data_sheet_says_is_told_with_its_s
 
 
 def test_tosses_that_do_not_fit_the_others_are_told_with_the_likeliest_cause_first() -> None:
-    left_out = stage_notices.of_register(done(RegisterResult((1,), (), (None,))))[0]
-    for notice in (left_out, stage_notices.kept_apart([1])):
+    left_out = notices.of_register(done(RegisterResult((1,), (), (None,))))[0]
+    for notice in (left_out, notices.kept_apart([1])):
         assert "most often" in notice.text
         assert notice.text.index("most often") < notice.text.index("seldom")
         assert notice.text.index("seldom") < notice.text.index("another object")
@@ -117,7 +117,7 @@ def test_a_mask_that_was_empty_at_import_is_said_of_its_toss(data: Callable[[str
     cv2.imwrite(str(tmp_path / "in" / "toss_00" / "mask_first.png"), np.zeros_like(mask))
     import_folder(tmp_path / "in", tmp_path / "session")
     with Session.open(tmp_path / "session") as session:
-        [notice] = stage_notices.of_import(Mock(spec=Run, session=session, recorded=(0,)))  # type: ignore[arg-type]
+        [notice] = notices.of_import(Mock(spec=Run, session=session, recorded=(0,)))  # type: ignore[arg-type]
     assert notice.text == "toss 0: mask_first.png is empty, so it was left out"
 
 
@@ -127,42 +127,42 @@ def test_a_robot_whose_place_was_not_refined_and_a_corrected_depth_scale_are_sai
     with Session.open(record_tiny(frames=2, tosses=(0,))) as session:
         run: Any = Mock(spec=Run, session=session, recorded=(0,))
         robot = "place not refined: it is seen in too few frames"
-        place, scale = stage_notices.of_rig(run, rig_of(robot, 1.004, 0.0005))
+        place, scale = notices.of_rig(run, rig_of(robot, 1.004, 0.0005))
         assert "too few frames" in place.seen
         assert "toss-calibrate hand-eye" in place.do
         assert "0.40 +- 0.05 % too far" in scale.seen
-        assert stage_notices.of_rig(run, rig_of({"moved_mm": 1})) == []
+        assert notices.of_rig(run, rig_of({"moved_mm": 1})) == []
         nobody = "no joint states of a Franka Panda in these tosses"
-        assert stage_notices.of_rig(run, rig_of(nobody)) == []  # thrown by hand: nothing to say
+        assert notices.of_rig(run, rig_of(nobody)) == []  # thrown by hand: nothing to say
 
 
 def test_others_that_move_and_frames_without_depth_are_said_of_their_toss() -> None:
-    others, bare = stage_notices.of_masks(3, masks_of(4, 2))
+    others, bare = notices.of_masks(3, masks_of(4, 2))
     assert "toss 3: in 4 of 20 frames something else" in others.seen
     assert "toss 3: 2 of 20 frames came without a depth image" in bare.seen
-    assert stage_notices.of_masks(3, masks_of()) == []
+    assert notices.of_masks(3, masks_of()) == []
 
 
 def test_few_frames_that_no_pose_fits_are_most_likely_noise_and_many_are_most_likely_a_wrong_mask() -> None:
-    [few], [many] = (stage_notices.of_track(1, done(TrackResult(35, 0, 0, n))) for n in (9, 25))
+    [few], [many] = (notices.of_track(1, done(TrackResult(35, 0, 0, n))) for n in (9, 25))
     assert "in 9 of 35 frames" in few.seen
     assert few.do.index("noisy depth") < few.do.index("not rigid")
     assert many.do.index("mask") < many.do.index("not rigid")
-    assert stage_notices.of_track(1, done(TrackResult(35, 0, 0))) == []
+    assert notices.of_track(1, done(TrackResult(35, 0, 0))) == []
 
 
 def test_what_contact_says_of_itself_is_read_from_its_result(tmp_path: Path) -> None:
     said = left_out_notice(2, "it jumps at frame 50")
     (tmp_path / "result.json").write_text(json.dumps({"warnings": [said.to_json()]}))
-    assert stage_notices.of_contact(done(None, tmp_path)) == [said]
-    assert stage_notices.of_contact(done(None, tmp_path / "kept_out")) == []
+    assert notices.of_contact(done(None, tmp_path)) == [said]
+    assert notices.of_contact(done(None, tmp_path / "kept_out")) == []
 
 
 def test_of_a_second_pass_it_is_said_that_it_was_kept_and_what_that_means() -> None:
     told = {"of": "all tosses", "same": False, "worse_share": 0.007}
-    [worse] = stage_notices.second_pass_kept(told, CycleConfig())
+    [worse] = notices.second_pass_kept(told, CycleConfig())
     assert worse.startswith("all tosses: the second pass was kept: it explains the raw images as well as the first")
     assert "0.7 % worse" in worse
-    better = stage_notices.second_pass_kept({**told, "worse_share": -0.1}, CycleConfig())
+    better = notices.second_pass_kept({**told, "worse_share": -0.1}, CycleConfig())
     assert "was kept: it explains the raw images better" in better[0]
-    assert "only repeats" in stage_notices.second_pass_kept({**told, "same": True}, CycleConfig())[0]
+    assert "only repeats" in notices.second_pass_kept({**told, "same": True}, CycleConfig())[0]

@@ -14,9 +14,9 @@ import pytest
 from processing.config import Config
 from processing.field.learn import LearnConfig
 from processing.field.train import FieldConfig
-from processing.pipeline import process
+from processing.pipeline.process import process
+from processing.pipeline.start import start_run
 from processing.sensor.still import StillSettings, kept_of, still_stretches
-from processing.start import start_run
 from processing.variants import rows_of
 from recordings.progress import Silent
 from recordings.records import RgbdFrame

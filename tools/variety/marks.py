@@ -164,8 +164,8 @@ def fusion_floor_cm(session_path: Path, truth_path: Path, place: Path) -> float 
     from processing.field.fuse import fuse
     from processing.field.learn import TossViews, chosen_views
     from processing.field.mesh import grid_mesh
+    from processing.pipeline.start import start_run
     from processing.sensor.frames import metric_frames
-    from processing.start import start_run
     from recordings.errors import BadInput
     from recordings.progress import Silent
 

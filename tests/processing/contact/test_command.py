@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from processing.contact.physics.geometry import CORNERS
-from processing.contact_command import contact_only
 from processing.motion.trajectory import rotation_matrices
+from processing.pipeline.contact_only import contact_only
 from processing.pose_source import PoseSource, find_poses, in_frame_of
 from recordings.console import chosen_tosses
 from recordings.errors import BadInput
@@ -80,7 +80,7 @@ def test_own_tracks_that_break_a_law_are_said_to_be_off_and_only_imported_poses_
     inverse = [replace(t, rotation=np.swapaxes(t.rotation, 1, 2).copy()) for t in real_tosses(range(3, 10))]
     turned = [replace(t, velocity_world_m_s=None, spin_object_rad_s=None) for t in inverse]
     source = PoseSource("track of variant ours", turned, None, of_vision=of_vision)
-    monkeypatch.setattr("processing.contact_command.find_poses", lambda *_: source)
+    monkeypatch.setattr("processing.pipeline.contact_only.find_poses", lambda *_: source)
     with pytest.raises(BadInput) as refused:
         contact_only(poses_session, tmp_path / "out", train="3-8", test="9", geometry="box", init_m=0.05, steps=20)
     assert ("import the data again" in str(refused.value)) is not of_vision
@@ -95,7 +95,7 @@ def test_tracks_that_fall_too_slowly_are_said_to_be_scaled_and_only_imported_pos
         replace(t, toss=n, position_m=0.8 * t.position_m) for n, t in zip((3, 4, 7, 8, 9), simulated_tosses(5, 130))
     ]
     source = PoseSource("track of variant ours", slow, None, of_vision=of_vision)
-    monkeypatch.setattr("processing.contact_command.find_poses", lambda *_: source)
+    monkeypatch.setattr("processing.pipeline.contact_only.find_poses", lambda *_: source)
     with pytest.raises(BadInput, match="free fall reads 7.8") as refused:
         contact_only(poses_session, tmp_path / "out", train="3-8", test="9", geometry="box", init_m=0.05, steps=20)
     assert ("import it again" in str(refused.value)) is not of_vision

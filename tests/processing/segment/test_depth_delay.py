@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from processing.config import Config
+from processing.pipeline.start import start_run
 from processing.run import Run
 from processing.segment.background.depth_delay import (
     DepthDelay,
@@ -29,7 +30,6 @@ from processing.stages.recording.depth_delay import with_depth_in_time
 from processing.stages.recording.rig import refine_rig
 from processing.stages.recording.scene import learn_static_scene
 from processing.stages.segment import segment
-from processing.start import start_run
 from recordings.geometry import Transform, rotation_exp, rotation_log
 from recordings.progress import Silent
 from recordings.records import RgbdFrame

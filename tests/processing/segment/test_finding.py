@@ -12,6 +12,7 @@ import pytest
 
 from processing.cli import main
 from processing.config import Config
+from processing.pipeline.start import start_run
 from processing.segment.background.follow import BackgroundSettings
 from processing.segment.background.segmenter import BackgroundSegmenter
 from processing.segment.background.static_scene import SceneSettings, StaticScene, learn_scene
@@ -27,7 +28,6 @@ from processing.segment.detect.detection import (
 from processing.segment.detect.tracklets import Appearance, TrackletSettings, choose, free_fall, join
 from processing.stages.lose import without_lost
 from processing.stages.segment import SegmentResult
-from processing.start import start_run
 from processing.store import Done
 from recordings.errors import BadInput
 from recordings.progress import Silent

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from processing.config import Config
+from processing.pipeline.start import start_run
 from processing.run import Run
 from processing.segment.background.follow import BackgroundSettings
 from processing.segment.background.moving_camera import why_other_scene
@@ -26,7 +27,6 @@ from processing.stages.find import find_object
 from processing.stages.recording.rig import refine_rig
 from processing.stages.recording.scene import learn_static_scene, scene_notes
 from processing.stages.segment import segment
-from processing.start import start_run
 from recordings.errors import DamagedFile
 from recordings.geometry import rotation_exp
 from recordings.progress import Silent

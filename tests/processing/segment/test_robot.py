@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import pytest
 
+from processing.pipeline.start import start_run
 from processing.segment.background.depth_scale import DepthScaleSettings, posterior_scale, table_scale
 from processing.segment.background.static_scene import StaticScene, calibrated_table_depth
 from processing.segment.robot.fit import (
@@ -30,7 +31,6 @@ from processing.stages.find import find_object
 from processing.stages.recording.rig import refine_rig
 from processing.stages.recording.scene import learn_static_scene
 from processing.stages.segment import segment
-from processing.start import start_run
 from recordings.geometry import CameraModel, Transform, rotation_exp, rotation_log
 from recordings.progress import Silent
 from recordings.records import ArmStates, RgbdFrame

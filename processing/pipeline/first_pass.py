@@ -10,9 +10,9 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from processing import stage_notices as say
 from processing.images import Images
-from processing.passes import Pass
+from processing.pipeline import notices as say
+from processing.pipeline.passes import Pass
 from processing.run import Run, each
 from processing.stages.field import learn_field
 from processing.stages.fuse import fuse_frames

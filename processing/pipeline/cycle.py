@@ -7,9 +7,9 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from processing import stage_notices as say
 from processing.images import Images
-from processing.passes import Pass, comparison
+from processing.pipeline import notices as say
+from processing.pipeline.passes import Pass, comparison
 from processing.refine.image_residuals import Explained, difference
 from processing.run import Run, both, each
 from processing.stages.contact import learn_contact

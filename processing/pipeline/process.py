@@ -7,13 +7,13 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
-from processing import stage_notices as say
 from processing.baselines.frame_to_model import FrameToModel
-from processing.cycle import run_cycle
-from processing.first_pass import first_pass, start_alone
 from processing.images import Images, every_frame, raw_images
-from processing.passes import Pass
-from processing.record import write_record
+from processing.pipeline import notices as say
+from processing.pipeline.cycle import run_cycle
+from processing.pipeline.first_pass import first_pass, start_alone
+from processing.pipeline.passes import Pass
+from processing.pipeline.record import write_record
 from processing.run import Run, each, with_noise
 from processing.stages.field import learn_field
 from processing.stages.find import find_object

@@ -5,8 +5,8 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 
-from processing import stage_notices as say
-from processing.passes import Pass
+from processing.pipeline import notices as say
+from processing.pipeline.passes import Pass
 from processing.run import Run
 from processing.stages.recording.every_frame import in_every_frame
 from processing.stages.recording.rig import RigResult
