@@ -161,4 +161,4 @@ def test_no_paragraph_of_the_architecture_is_longer_than_120_words_and_every_fil
 
 
 def test_the_pipeline_is_on_one_screen():
-    assert len((ROOT / "processing" / "pipeline.py").read_text().splitlines()) <= 120
+    assert len((ROOT / "processing" / "pipeline" / "process.py").read_text().splitlines()) <= 120
