@@ -54,7 +54,7 @@ class FrontConfig:
         )
     )
     """No feature matches and no search within a frame's time."""
-    seek: ShapeConfig = field(default_factory=lambda: ShapeConfig(turns=240, tried=12, starts=4))
+    seek: ShapeConfig = field(default_factory=lambda: ShapeConfig(turns=240, tried=16, starts=8))
     foreground: ForegroundSettings = field(default_factory=ForegroundSettings)
     view: ViewConfig = field(default_factory=ViewConfig)
     reach: float = 0.75
