@@ -82,22 +82,30 @@ class TrajectoryHypothesis:
         return self.cost + self.against
 
 
-def select(
+def all_refined(
     scene: Scene, hypotheses: list[Hypothesis], first: int, keep_first: bool, config: HypothesisConfig
 ) -> list[TrajectoryHypothesis]:
-    """The hypotheses after joint refinement, best first. Where they agree the first will do, unless the body is round
-    and all its frames together show other azimuths. Where they do not agree, the images leave some rotation open, and a
-    refinement that trusts steady motion first is tried too."""
+    """The hypotheses after joint refinement, the cheapest first. Where they agree the first will do."""
     n = len(scene.times_s)
     apart = max((apart_deg(hypotheses[0].poses[:n], s.poses[:n]) for s in hypotheses[1:]), default=0.0)
-    agree = apart < config.agreeing_deg
-    out = [refined(scene, s, first, keep_first, config) for s in (hypotheses[:1] if agree else hypotheses)]
-    out.sort(key=lambda s: s.cost)
-    sought = _sought(scene, out, first, keep_first, config) if len(hypotheses) > 1 else None
+    different = hypotheses[:1] if apart < config.agreeing_deg else hypotheses
+    return sorted((refined(scene, s, first, keep_first, config) for s in different), key=lambda s: s.cost)
+
+
+def select(
+    scene: Scene, hypotheses: list[TrajectoryHypothesis], first: int, keep_first: bool, tracked: bool,
+    config: HypothesisConfig,
+) -> list[TrajectoryHypothesis]:  # fmt: skip
+    """The hypotheses, best first. If the body is round and all its frames together show other azimuths (which is looked
+    into where the poses were `tracked`, not given), these. Where hypotheses leave a rotation open, a refinement that
+    trusts steady motion first is tried too."""
+    out = sorted(hypotheses, key=lambda s: s.cost)
+    sought = _sought(scene, out, first, keep_first, config) if tracked else None
     if sought is not None and _is_rather_round(scene, sought, out[0], config):
         return _again([sought], scene, first, keep_first, replace(config, graph=config.round_body))
     out = _compared(scene, out, config)
-    if not agree and any(_leave_open(out[0].joint.poses[:n], s.joint.poses[:n], config) for s in out[1:]):
+    n = len(scene.times_s)
+    if any(leave_open(out[0].joint.poses[:n], s.joint.poses[:n], config) for s in out[1:]):
         steady = replace(config, graph=config.steady)
         smooth = refined(scene, replace(out[0].estimated, poses=out[0].joint.poses), first, keep_first, steady)
         out.append(refined(scene, replace(smooth.estimated, poses=smooth.joint.poses), first, keep_first, config))
@@ -202,7 +210,7 @@ def _delayed(scene: Scene) -> bool:
     return any(c is not None and abs(c.depth_delay_s) > LEAST_DELAY_S for c in scene.store.crops)
 
 
-def _leave_open(one: Float[Array, "n 4 4"], other: Float[Array, "n 4 4"], config: HypothesisConfig) -> bool:
+def leave_open(one: Float[Array, "n 4 4"], other: Float[Array, "n 4 4"], config: HypothesisConfig) -> bool:
     """Whether two hypotheses differ in more frames than an impact blurs: then the images leave a rotation open."""
     rotations = _rotations_deg(one, other)
     return bool(np.mean(rotations > config.agreeing_deg) > config.impacts) if len(rotations) else False

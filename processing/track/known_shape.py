@@ -7,7 +7,7 @@ colour in them, and a shape without colours has none anywhere.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -19,7 +19,7 @@ from processing.sensor import view_layout as lay
 from processing.sensor.rectification import Rectification
 from processing.sensor.view import Crop
 from processing.track import kernels as k
-from processing.track.beam import BeamConfig, Candidate, Scene, merged
+from processing.track.beam import BeamConfig, Candidate, Hypothesis, Scene, merged
 from processing.track.keyframes import references
 from processing.track.schedule import Schedule, rows
 from recordings.errors import BadInput
@@ -147,6 +147,13 @@ def located(scene: Scene, view: int, model: ShapeViews, beam: BeamConfig, config
     )
     good = [c for c in fine if c.fit < beam.lost and c.fit < fine[0].fit + config.spread]
     return good[: config.starts]
+
+
+def with_model(h: Hypothesis, model: ShapeViews) -> Hypothesis:
+    """The hypothesis with the model's views (after the frames') among its keyframes."""
+    n, m = len(h.costs), len(model.poses)
+    keys = (*range(n, n + m), *h.keyframes)
+    return replace(h, poses=np.concatenate([h.poses, model.poses]), keyframes=keys)
 
 
 def _grid(scene: Scene, view: int, config: ShapeConfig) -> list[Float[Array, "4 4"]]:

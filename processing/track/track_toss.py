@@ -31,9 +31,16 @@ from processing.track.flags import (
     unjoined_uncertainty,
 )
 from processing.track.flight import FlightConfig, flights_followed, flying
-from processing.track.hypotheses import HypothesisConfig, TrajectoryHypothesis, anchored_to, apart_deg, select
+from processing.track.hypotheses import (
+    HypothesisConfig,
+    TrajectoryHypothesis,
+    all_refined,
+    anchored_to,
+    apart_deg,
+    select,
+)
 from processing.track.keyframes import extended
-from processing.track.known_shape import ShapeConfig, ShapeViews, center_of, located, shape_views
+from processing.track.known_shape import ShapeConfig, ShapeViews, center_of, located, shape_views, with_model
 from processing.track.windows import WindowConfig, through_windows
 from recordings.errors import BadInput
 from recordings.geometry import CameraModel, Transform
@@ -159,15 +166,20 @@ def track_toss(
     world = None if world_from_camera is None else world_from_camera.matrix
     center_m = _first_center_m(store, first, known) if model is None else center_of(model)
     scene = Scene(store, times_s, gravity_in_camera(world), center_m, matcher or Sift(), hand=hand)
-    flight = flying(scene, len(frames), config.flight)
-    scene = replace(scene, flying=np.isin(np.arange(len(frames)), flight))
+    n = len(frames)
+    scene = replace(scene, flying=np.isin(np.arange(n), flying(scene, n, config.flight)))
     if known.poses is None:
         hypotheses, margin, rejected = _followed(scene, first, known, config, progress)
     else:
         hypothesis, margin, rejected = _filled_in(scene, known, config, progress)
         hypotheses = [hypothesis]
     keep_first = model is None or known.start is not None
-    joint = select(scene, hypotheses, first, keep_first, config.hypotheses)
+    found = all_refined(scene, hypotheses, first, keep_first, config.hypotheses)
+    found += through_windows(
+        scene, first, found, config.beam.keyframes, config.windows, config.hypotheses,
+        lambda share: progress.step(2 * n + int(share * n), 3 * n, "windows"),
+    )  # fmt: skip
+    joint = select(scene, found, first, keep_first, known.poses is None, config.hypotheses)
     frame = object_frame if model is None else model.object_frame
     return _as_track(scene, joint, first, margin, rejected, config, toss, camera.frame, frame, frames)
 
@@ -287,8 +299,6 @@ def _followed(
         if all(apart_deg(best.poses[:n], s.poses[:n]) > config.separate_deg for s in hypotheses):
             hypotheses.append(best)
         hypotheses += _through_flights(scene, first, best, hypotheses, narrow, config)
-        so_far = [best, *hypotheses]
-        hypotheses += through_windows(scene, first, so_far, config.beam.keyframes, config.windows, config.hypotheses)
     out = []
     for hypothesis in hypotheses:
         if any(scene.store.usable(i) for i in range(first)):
@@ -319,22 +329,15 @@ def _starts(scene: Scene, first: int, known: _Known, config: TrackConfig) -> tup
         pose = first_pose(scene.store, first) if known.start is None else known.start
         return [started(scene.store, n, first, pose)], config.beam
     if known.start is not None:
-        return [_with_model(started(scene.store, n, first, known.start), known.model)], config.beam
+        return [with_model(started(scene.store, n, first, known.start), known.model)], config.beam
     wide = replace(config.beam, width=max(config.beam.width, config.shape.starts))
     beam = []
     for found in located(scene, first, known.model, config.beam, config.shape):
-        h = _with_model(started(scene.store, n, first, found.pose), known.model)
+        h = with_model(started(scene.store, n, first, found.pose), known.model)
         beam.append(replace(h, total=found.fit))
     if not beam:
         raise BadInput("the given shape fits nothing that the first frame shows; is it a shape of this object?")
     return beam, wide
-
-
-def _with_model(h: Hypothesis, model: ShapeViews) -> Hypothesis:
-    """The hypothesis with the model's views (after the frames') among its keyframes."""
-    n, m = len(h.costs), len(model.poses)
-    keys = (*range(n, n + m), *h.keyframes)
-    return replace(h, poses=np.concatenate([h.poses, model.poses]), keyframes=keys)
 
 
 def _filled_in(
@@ -348,7 +351,7 @@ def _filled_in(
     poses[given] = known.poses[given]
     h = Hypothesis(poses, np.full(n, np.nan), np.full(n, np.nan), tuple(given), (given[0],), 0.0)
     if known.model is not None:
-        h = _with_model(h, known.model)
+        h = with_model(h, known.model)
     h = replace(h, keyframes=extended(h.keyframes, h.poses, given, scene.center_m, config.beam.keyframes))
     rejected: dict[int, list[Candidate]] = {}
     for i in range(n):
@@ -380,6 +383,8 @@ def _as_track(
     for other in hypotheses[1:]:
         apart = other.total - best.total
         twists = twists + uncertainty(joint.poses[:n], other.joint.poses[:n], apart, config.flags)
+        if apart_deg(joint.poses[:n], other.joint.poses[:n]) > config.hypotheses.agreeing_deg:
+            margin = min(margin, apart)
     twists = twists + unknown_motion(scene, joint.poses[:n], best.use)
     hanging = unjoined(joint.pairs, joint.figures, (first, *range(n, len(scene.store))), best.use & ~lost, config.flags)
     slipped = contradicting(
@@ -391,8 +396,5 @@ def _as_track(
     track = ObjectTrack(toss, camera, object_frame, times_ns, poses, status, covariance)
     keyframes = tuple(i for i in sorted(best.estimated.keyframes) if i < n and not lost[i])
     pairs = joint.pairs[(joint.pairs < n).all(1)]
-    for other in hypotheses[1:]:
-        if apart_deg(joint.poses[:n], other.joint.poses[:n]) > config.hypotheses.agreeing_deg:
-            margin = min(margin, other.total - best.total)
     return TossTrack(track, cost, on, keyframes, pairs, rejected, best.center_m, margin, scene.store,
                      best.held, best.axis is not None)  # fmt: skip

@@ -8,7 +8,7 @@ pairs of views one and two frames apart say (the cheapest path, Viterbi), refine
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -20,7 +20,7 @@ from processing.motion.interpolate import turn_between
 from processing.track import kernels as k
 from processing.track.beam import Hypothesis, Scene
 from processing.track.flight import FlightConfig, solved
-from processing.track.hypotheses import HypothesisConfig, TrajectoryHypothesis, apart_deg, refined
+from processing.track.hypotheses import HypothesisConfig, TrajectoryHypothesis, leave_open, refined
 from processing.track.keyframes import KeyframeConfig, extended
 from processing.track.pairs import compared
 from processing.track.schedule import Schedule, rows
@@ -51,36 +51,41 @@ class WindowConfig:
     same_m: float = 0.002
     """Motions that are nearer to each other are one."""
     rounds: int = 3
-    """How often steps are linked and refined; each adds what the refinement found to the motions that are linked."""
+    """How often steps are linked and refined (0: no windows are laid); each time adds what the refinement found to the
+    motions that are linked."""
 
 
 def through_windows(
-    scene: Scene, first: int, hypotheses: Sequence[Hypothesis], keyframes: KeyframeConfig, config: WindowConfig,
-    refinement: HypothesisConfig,
-) -> list[Hypothesis]:  # fmt: skip
-    """The hypothesis that the windows' steps and those of the `hypotheses` make together, through the first one's pose
-    of frame `first`; none where all hypotheses agree, which leaves nothing open, or where frames are too few."""
-    n, best = len(scene.times_s), hypotheses[0]
+    scene: Scene, first: int, hypotheses: Sequence[TrajectoryHypothesis], keyframes: KeyframeConfig,
+    config: WindowConfig, refinement: HypothesisConfig, report: Callable[[float], None] = lambda _: None,
+) -> list[TrajectoryHypothesis]:  # fmt: skip
+    """The hypothesis that the windows' steps and those of the `hypotheses` (the best one first) make together, through
+    the best one's pose of frame `first`; none where all of them agree, which leaves nothing open, or where frames are
+    too few. `report` is told the share of the work that is done."""
+    n, best = len(scene.times_s), hypotheses[0].joint.poses
     usable = np.array([i for i in range(n) if scene.store.usable(i)], dtype=np.int64)
-    open_deg = max((apart_deg(best.poses[:n], h.poses[:n]) for h in hypotheses[1:]), default=0.0)
-    if open_deg < config.solved.same_deg or len(usable) < config.frames:
+    unsure = any(leave_open(best[:n], h.joint.poses[:n], refinement) for h in hypotheses[1:])
+    if config.rounds == 0 or not unsure or len(usable) < config.frames:
         return []
     still = np.array([scene.store.stands_still(int(i), int(j)) for i, j in zip(usable, usable[1:])])
-    steps = _foretold(scene, usable, still, config)
+    steps = _foretold(scene, usable, still, config, lambda share: report(0.6 * share))
     for h in hypotheses:
-        _remember(steps, h.poses, usable, still)
+        _remember(steps, h.joint.poses, usable, still)
     found: list[TrajectoryHypothesis] = []
-    for _ in range(config.rounds):
-        poses = _poses(_linked(scene, usable, steps, config), usable, first, best.poses[first], n)
+    for done in range(config.rounds):
+        report(0.6 + 0.4 * done / config.rounds)
+        poses = _poses(_linked(scene, usable, steps, config), usable, first, best[first], n)
         keys = extended((first,), poses, usable.tolist(), scene.center_m, keyframes)
         linked = Hypothesis(poses, np.full(n, np.nan), np.full(n, np.nan), tuple(range(n)), keys, 0.0)
         found.append(refined(scene, linked, first, True, refinement))
         _remember(steps, found[-1].joint.poses, usable, still)
-    chosen = min(found, key=lambda h: h.cost)
-    return [replace(chosen.estimated, poses=chosen.joint.poses)]
+    return [min(found, key=lambda h: h.cost)]
 
 
-def _foretold(scene: Scene, usable: Int[Array, " u"], still: Bool[Array, " s"], config: WindowConfig) -> list[Motions]:
+def _foretold(
+    scene: Scene, usable: Int[Array, " u"], still: Bool[Array, " s"], config: WindowConfig,
+    report: Callable[[float], None],
+) -> list[Motions]:  # fmt: skip
     """What windows foretell of each step between usable frames; a window speaks of the steps beside it, too, because
     an impact may have come before or after them."""
     steps: list[Motions] = [[] for _ in still]
@@ -90,6 +95,7 @@ def _foretold(scene: Scene, usable: Int[Array, " u"], still: Bool[Array, " s"], 
         gap_s = float(np.diff(scene.times_s[frames]).max())
         if still[b : b + config.frames - 1].all() or gap_s > config.longest_step * usual_s:
             continue
+        report(b / len(usable))
         for window in solved(_falling(scene, frames), frames, config.solved):
             motions = [two @ se3.inverse(one) for one, two in zip(window.poses, window.poses[1:])]
             for a, motion in zip(range(b - 1, b + config.frames), [motions[0], *motions, motions[-1]]):

@@ -11,7 +11,8 @@ from numpy import ndarray as Array
 
 from processing.features.sift import Sift
 from processing.motion.motion_prior import gravity_in_camera
-from processing.track.beam import Hypothesis, Scene
+from processing.track.beam import Scene
+from processing.track.hypotheses import TrajectoryHypothesis, refined
 from processing.track.track_toss import TrackConfig, first_pose, started, views_of
 from processing.track.windows import WindowConfig, _distinct, _poses, through_windows
 from recordings.geometry import Transform, rotation_angle_rad, rotation_exp
@@ -46,14 +47,18 @@ def scene(tiny_world: Any) -> Scene:
     return Scene(store, times_s, gravity, np.array([0.0, 0.0, 0.03]), Sift())
 
 
-def sliding(scene: Scene, spin: Array) -> Hypothesis:
-    """A trajectory that follows the cloud and turns steadily (rad/s, camera axes), whatever the images show."""
+def sliding(scene: Scene, spin: Array) -> TrajectoryHypothesis:
+    """A trajectory that follows the cloud and turns steadily (rad/s, camera axes), whatever the images show: it is not
+    refined, only judged."""
     h = started(scene.store, FRAMES, 0, first_pose(scene.store, 0))
     poses = np.tile(h.poses[0], (FRAMES, 1, 1))
     for i, pose in enumerate(poses):
         pose[:3, :3] = rotation_exp(spin * i * STEP_S) @ pose[:3, :3]
         pose[:3, 3] += scene.store.center_m[i] - scene.store.center_m[0]
-    return replace(h, poses=poses, done=tuple(range(FRAMES)))
+    estimated = replace(h, poses=poses, done=tuple(range(FRAMES)))
+    graph = replace(TrackConfig().hypotheses.graph, schedule=((0, 1, 0.004, 0.1, 0.004, 0.5),))
+    judged = refined(scene, estimated, 0, True, replace(TrackConfig().hypotheses, graph=graph))
+    return replace(judged, joint=replace(judged.joint, poses=poses))
 
 
 def test_windows_find_both_spins_of_an_impact_that_no_hypothesis_has(scene: Scene, tiny_world: Any) -> None:
@@ -61,12 +66,12 @@ def test_windows_find_both_spins_of_an_impact_that_no_hypothesis_has(scene: Scen
     config = TrackConfig()
     (found,) = through_windows(scene, 0, wrong, config.beam.keyframes, config.windows, config.hypotheses)
     camera = tiny_world.world_from_camera.rotation
-    np.testing.assert_array_equal(found.poses[0], wrong[0].poses[0])
+    np.testing.assert_array_equal(found.joint.poses[0], wrong[0].joint.poses[0])
     for i in range(1, FRAMES):
-        turn = found.poses[i, :3, :3] @ found.poses[0, :3, :3].T
+        turn = found.joint.poses[i, :3, :3] @ found.joint.poses[0, :3, :3].T
         true = camera.T @ thrown(i).rotation @ thrown(0).rotation.T @ camera
         assert np.degrees(rotation_angle_rad(turn @ true.T)) < 6.0
-    assert len(found.keyframes) > 1
+    assert len(found.estimated.keyframes) > 1
 
 
 def test_where_all_hypotheses_agree_nothing_is_left_open(scene: Scene) -> None:
