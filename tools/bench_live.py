@@ -4,7 +4,7 @@ what was wanted.
 python tools/bench_live.py toss SESSION [--tosses 10]      # from the finished file to the verdict, alone on the machine
 python tools/bench_live.py rates SESSION [--tosses 10]     # the same while another process records at the lab's rates
 python tools/bench_live.py pose SESSION [--learn 3] [--tosses 2]    # the causal pose against the smoothed one
-python tools/bench_live.py growth SESSION                  # CPU seconds of a look for 2, 5, 10 tosses
+python tools/bench_live.py growth SESSION                  # CPU seconds of a look for 2, 5, 10, 20 tosses
 
 SESSION is a finished one; its tosses are handed over one by one, each when the one before was judged. `rates` counts
 the drops of bench_record's recorder (848x480 colour and depth, three grey cameras of 1440x1080, 1 kHz of joint states).
@@ -168,8 +168,10 @@ def _near(pose: np.ndarray | None, smoothed: np.ndarray, together: Together) -> 
 def bench_growth(session: Path) -> bool:
     """CPU seconds per frame of a look: wanted the same however many tosses there are."""
     with tempfile.TemporaryDirectory() as place:
-        found = [look for look, _, _ in looks(session, 10, Path(place))]
-    for count in (2, 5, 10):
+        found = [look for look, _, _ in looks(session, 20, Path(place))]
+    for count in (2, 5, 10, 20):
+        if count > len(found):
+            break
         part = found[:count]
         frames = sum(len(look.joined.track.status) for look in part)
         cpu_s = sum(look.cpu_s for look in part)
