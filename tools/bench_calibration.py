@@ -2,8 +2,10 @@
 
 TOSSLAB_CALIBRATION_SETS=FOLDER python tools/bench_calibration.py          # FOLDER/OWNER/REPOSITORY: clones
 python tools/bench_calibration.py barry-left paper                         # some
+python tools/bench_calibration.py --partitions 6 paper                     # shuffled six times, means by view
 
-Each fifth of a set's views, in their order, is kept aside once (the outer hold-out); from the rest come our lens
+Each fifth of a set's views, in their order (or shuffled: `--partitions`, for one partition alone moves a difference by
+as much as it is), is kept aside once (the outer hold-out); from the rest come our lens
 (`calibrate_intrinsics` with its own choice of a model), OpenCV's on the same corners, and OpenCV's on the corners that
 its examples find. Each leaves a residual on the views aside, where only the board's pose is found: `aside`, root mean
 square in px on our corners. `z`: by how many standard errors ours leaves less than OpenCV's, view by view (below -2:
@@ -18,6 +20,7 @@ from __future__ import annotations
 import argparse
 import os
 import re
+from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -140,16 +143,20 @@ Aside = dict[int, float]
 
 
 def outer_hold_out(
-    views: Sequence[TargetView], ways: Mapping[str, Callable[[Sequence[int]], CameraModel]]
+    views: Sequence[TargetView], ways: Mapping[str, Callable[[Sequence[int]], CameraModel]], partitions: int | None
 ) -> dict[str, Aside]:
-    """By way of fitting (a lens from views of these numbers), the mean square that it leaves of each view aside."""
-    found: dict[str, Aside] = {way: {} for way in ways}
-    for fold in range(OUTER):
-        aside = np.array_split(np.arange(len(views)), OUTER)[fold].tolist()
-        rest = [v for v in range(len(views)) if v not in aside]
+    """By way of fitting (a lens from views of these numbers), the mean square that it leaves of each view aside; over
+    so many random partitions its mean (None: one, in the views' order)."""
+    count, found = len(views), {way: defaultdict[int, list[float]](list) for way in ways}
+    orders = [np.arange(count)]
+    if partitions is not None:
+        orders = [np.random.default_rng(seed).permutation(count) for seed in range(partitions)]
+    for aside in (sorted(part.tolist()) for order in orders for part in np.array_split(order, OUTER)):
+        rest = [v for v in range(count) if v not in aside]
         for way, fit in ways.items():
-            found[way] |= {v: float(q.mean()) for v, q in squares_aside(fit(rest), views, aside).items()}
-    return found
+            for v, squares in squares_aside(fit(rest), views, aside).items():
+                found[way][v].append(float(squares.mean()))
+    return {way: {v: float(np.mean(q)) for v, q in left.items()} for way, left in found.items()}
 
 
 def rms(aside: Aside) -> float:
@@ -157,7 +164,7 @@ def rms(aside: Aside) -> float:
     return float(np.sqrt(np.mean([*aside.values()])))
 
 
-def row(name: str) -> str:
+def row(name: str, partitions: int | None = None) -> str:
     """One set: the outer hold-out, and the focal length of all views against the published one."""
     real = REAL[name]
     images = real.images()
@@ -173,7 +180,7 @@ def row(name: str) -> str:
     usual = usual_corners(real.board, images, found) if isinstance(real.board, Chessboard) else []
     if len(usual) == len(views):
         ways["usual"] = lambda rest: opencv_lens(name, size, [usual[v] for v in rest])
-    aside = outer_hold_out(views, ways)
+    aside = outer_hold_out(views, ways, partitions)
     lens, plain = calibrate_intrinsics(name, size, views), opencv_lens(name, size, views)
     text = f"{name:14s} {len(views):3d} views  aside " + "  ".join(f"{way} {rms(a):.4f}" for way, a in aside.items())
     text += f"  z {gain_by_chance(aside['ours'], aside['cv2']):+.1f} | {focal(lens)}; cv2 {plain.fx:.2f}"
@@ -295,5 +302,7 @@ WITHIN_RIGS = {"barry-pair": pair, "paper-hand": hand}
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("sets", nargs="*", help=f"of {', '.join([*REAL, *WITHIN_RIGS])}; all where none is named")
-    for name in parser.parse_args().sets or [*REAL, *WITHIN_RIGS]:
-        print(WITHIN_RIGS[name]() if name in WITHIN_RIGS else row(name), flush=True)
+    parser.add_argument("--partitions", type=int, metavar="N", help="random ones, instead of one in order")
+    args = parser.parse_args()
+    for name in args.sets or [*REAL, *WITHIN_RIGS]:
+        print(WITHIN_RIGS[name]() if name in WITHIN_RIGS else row(name, args.partitions), flush=True)
