@@ -5,8 +5,8 @@ python tools/bench_calibration.py barry-left paper                         # som
 python tools/bench_calibration.py --partitions 6 paper                     # shuffled six times, means by view
 
 Each fifth of a set's views, in their order (or shuffled: `--partitions`, for one partition alone moves a difference by
-as much as it is), is kept aside once (the outer hold-out); from the rest come our lens
-(`calibrate_intrinsics` with its own choice of a model), OpenCV's on the same corners, and OpenCV's on the corners that
+as much as it is), is kept aside once (the outer hold-out); from the rest come our lens (`calibrate_intrinsics` with its
+own choice of a model), OpenCV's on the same corners, and OpenCV's on the corners that
 its examples find. Each leaves a residual on the views aside, where only the board's pose is found: `aside`, root mean
 square in px on our corners. `z`: by how many standard errors ours leaves less than OpenCV's, view by view (below -2:
 worse beyond chance). `published` is the residual that the published lens itself leaves of all views.

@@ -76,12 +76,12 @@ class Looker:
             session.close()
 
     def learn_scene_again(self, tosses: tuple[int, ...]) -> None:
-        """The static scene from more tosses, once one was looked at."""
-        if self.shared is None:
-            return
+        """The static scene from more tosses."""
         session = self._open(tosses)
         try:
-            self.shared, self.learned_from = self.shared.with_scene_of(self._run(session, tosses)), tosses
+            run = self._run(session, tosses)
+            self.shared = Shared.of(run) if self.shared is None else self.shared.with_scene_of(run)
+            self.learned_from = tosses
         finally:
             session.close()
 

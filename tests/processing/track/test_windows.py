@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 from numpy import ndarray as Array
 
+from processing.config import Config
 from processing.features.sift import Sift
+from processing.live.config import light
 from processing.motion.motion_prior import gravity_in_camera
 from processing.track.beam import Scene
 from processing.track.hypotheses import TrajectoryHypothesis, refined
@@ -84,6 +86,21 @@ def test_too_few_frames_make_no_window(scene: Scene) -> None:
     wrong, config = [sliding(scene, np.zeros(3)), sliding(scene, np.array([0.0, 4.0, 0.0]))], TrackConfig()
     more = replace(config.windows, frames=FRAMES + 1)
     assert through_windows(scene, 0, wrong, config.beam.keyframes, more, config.hypotheses) == []
+
+
+def test_the_live_looks_settings_lay_no_windows(scene: Scene) -> None:
+    config = light(Config()).track
+    wrong = [sliding(scene, np.zeros(3)), sliding(scene, np.array([0.0, 4.0, 0.0]))]
+    assert through_windows(scene, 0, wrong, config.beam.keyframes, config.windows, config.hypotheses) == []
+
+
+def test_the_share_that_is_done_grows(scene: Scene) -> None:
+    wrong, config = [sliding(scene, np.zeros(3)), sliding(scene, np.array([0.0, 4.0, 0.0]))], TrackConfig()
+    told: list[float] = []
+    through_windows(scene, 0, wrong, config.beam.keyframes, config.windows, config.hypotheses, told.append)
+    assert told[0] == 0.0
+    assert told == sorted(told)
+    assert 0.6 < told[-1] < 1.0
 
 
 def test_motions_that_move_the_body_alike_are_one() -> None:
