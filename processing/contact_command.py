@@ -37,17 +37,6 @@ def run(args: argparse.Namespace, session: Session, out_dir: Path, progress: Pro
     """What the command does; its document is what `--json` prints."""
     from processing.pipeline.contact_only import contact_only
 
-    document, text = contact_only(
-        session,
-        out_dir,
-        train=args.train,
-        test=args.test,
-        geometry=args.geometry,
-        init_m=args.init,
-        poses=args.poses,
-        steps=args.steps,
-        device=getattr(args, "device", "cpu") or "cpu",
-        truth=getattr(args, "truth", None),
-        progress=progress,
-    )
-    return Outcome(document, text)
+    asked = (args.train, args.test, args.geometry, args.init, args.poses, args.steps)
+    device = getattr(args, "device", "cpu") or "cpu"
+    return Outcome(*contact_only(session, out_dir, *asked, device, progress, getattr(args, "truth", None)))

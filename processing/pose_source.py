@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -46,19 +46,16 @@ def find_poses(
     return PoseSource("/track/pose", [PoseSeries.from_poses(t, p) for t, p in found.items()], None, note)
 
 
+@dataclass(frozen=True, eq=False)
 class PoseSource:
     """Where poses came from, the poses, the shape in their object frame where there is one, what a reader should know
     of them, and whether vision made them (else they were imported)."""
 
-    def __init__(
-        self,
-        name: str,
-        tracks: list[PoseSeries],
-        shape: ObjectShape | None,
-        note: str | None = None,
-        of_vision: bool = False,
-    ) -> None:
-        self.name, self.tracks, self.shape, self.note, self.of_vision = name, tracks, shape, note, of_vision
+    name: str
+    tracks: list[PoseSeries]
+    shape: ObjectShape | None
+    note: str | None = None
+    of_vision: bool = False
 
 
 def _truth_poses(session: Session, tosses: Sequence[int], given: Path | None, vision: PoseSource | None) -> PoseSource:

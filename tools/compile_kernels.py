@@ -17,6 +17,7 @@ import time
 from collections.abc import Iterator
 from importlib import import_module
 from multiprocessing.connection import Connection, wait
+from typing import Any
 
 TRACK = "processing.track.kernels"
 PROFILE = "processing.track.revolution.profile_kernels"
@@ -120,22 +121,23 @@ def compiled(module: str) -> tuple[str, float]:
     imported, begun = import_module(module), time.process_time()
     for (its, name), signatures in KERNELS.items():
         for types in signatures if its == module else ():
-            getattr(imported, name).compile(written(types))
+            getattr(imported, name).compile(as_called(types))
     return module, time.process_time() - begun
 
 
-def written(types: tuple[str, ...]) -> str:
-    """As numba reads it."""
-    return f"({', '.join(types)},)"
+def as_called(types: tuple[str, ...]) -> tuple[Any, ...]:
+    """The types as a call of the kernel has them: by these numba finds it on disk, by their spelling it would not."""
+    from numba.core.sigutils import normalize_signature
+
+    arguments, _ = normalize_signature(f"({', '.join(types)},)")
+    return arguments
 
 
 def unforeseen() -> list[str]:
     """Kernels that this process had compiled for other types than those above."""
-    from numba.core.sigutils import normalize_signature
-
     found = []
     for (module, name), signatures in KERNELS.items():
-        foreseen = {normalize_signature(written(types))[0] for types in signatures}
+        foreseen = {as_called(types) for types in signatures}
         used = getattr(import_module(module), name).signatures
         found += [f"{module}.{name}{types}" for types in used if types not in foreseen]
     return found

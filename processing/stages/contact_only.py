@@ -105,32 +105,16 @@ def learn_contact_only(
         _write(folder, session, learning, shape, evaluation, marked, document, plane)
         return ContactOnlyResult(result_text(learning, evaluation, more))
 
-    settings = {
-        "train": list(learned),
-        "test": list(tested),
-        "geometry": geometry or "from the data",
-        "init_m": init_m,
-        "steps": steps,
-        "steps_wanted": wanted,
-        "device": device,
-    }
-    done = Store(out_dir).run(
-        "contact-only",
-        VERSION,
-        settings,
-        {"poses": _digest(tracks, learned, tested), "about": _about(source, given, plane)},
-        ContactOnlyResult,
-        compute,
-    )
+    settings: dict[str, Any] = {"train": list(learned), "test": list(tested), "geometry": geometry or "from the data"}
+    settings |= {"init_m": init_m, "steps": steps, "steps_wanted": wanted, "device": device}
+    inputs = {"poses": _digest(tracks, learned, tested), "about": _about(source, given, plane)}
+    done = Store(out_dir).run("contact-only", VERSION, settings, inputs, ContactOnlyResult, compute)
     document = stage_document(done.folder / "result.json")
-    files = {
-        "folder": str(done.folder),
-        "plot": str(done.folder / "rollout.png"),
-        "assets": {f: str(done.folder / "assets" / f / f"object{s}") for f, s in ASSET_FILES.items()},
-        "reused": done.reused,
-    }
+    assets = {f: str(done.folder / "assets" / f / f"object{s}") for f, s in ASSET_FILES.items()}
+    plot = str(done.folder / "rollout.png")
+    files = {"folder": str(done.folder), "plot": plot, "assets": assets, "reused": done.reused}
     _record(out_dir, session, done.name)
-    text = f"{done.result.text}\nplot:    {files['plot']}\nassets:  {done.folder / 'assets'}"
+    text = f"{done.result.text}\nplot:    {plot}\nassets:  {done.folder / 'assets'}"
     return {**document, "files": files}, text
 
 
@@ -138,15 +122,9 @@ ASSET_FILES = {"urdf": ".urdf", "mjcf": ".xml", "drake-sdf": ".sdf"}
 
 
 def _write(
-    folder: Path,
-    session: Session,
-    learning: ContactLearning,
-    shape: ObjectShape,
-    evaluation: Evaluation,
-    marked: tuple[int, ...],
-    document: Mapping[str, Any],
-    plane: Plane,
-) -> None:
+    folder: Path, session: Session, learning: ContactLearning, shape: ObjectShape, evaluation: Evaluation,
+    marked: tuple[int, ...], document: Mapping[str, Any], plane: Plane,
+) -> None:  # fmt: skip
     write_contact(folder, learning.model)
     write_shape(folder, shape)
     write_assets(folder, learning.model, shape)
@@ -157,21 +135,11 @@ def _write(
 
 def _record(out_dir: Path, session: Session, stage: str) -> None:
     """The variant's record, so that exports find shape, contact model and assets."""
-    write_variant(
-        out_dir,
-        VariantRecord(
-            name="contact-only",
-            scope="all",
-            label="contact learning on given poses",
-            session_name=session.name,
-            object_name=session.object_name,
-            calibration=session.calibration,
-            tosses=(),
-            shape=stage,
-            contact=stage,
-            shared_object_frame=True,
-        ),
-    )
+    record = VariantRecord(
+        "contact-only", "all", "contact learning on given poses", session.name, session.object_name,
+        session.calibration, tosses=(), shape=stage, contact=stage, shared_object_frame=True,
+    )  # fmt: skip
+    write_variant(out_dir, record)
 
 
 def _digest(tracks: Mapping[int, PoseSeries], learned: Sequence[int], tested: Sequence[int]) -> str:
@@ -188,24 +156,16 @@ def _longest(tracks: Iterable[PoseSeries]) -> int:
     return max(int((t.time_s[-1] - t.time_s[0]) / STEP_S + 0.5) if len(t) else 0 for t in tracks)
 
 
-def _cut(wanted: int, steps: int) -> list[str]:
-    if wanted == steps:
-        return []
-    return [f"--steps {wanted}: no toss lasts that long; rolled out over {steps} steps, to the end of the longest one"]
-
-
 def _warnings(geometry: str | None, source: PoseSource, wanted: int, steps: int) -> list[str]:
-    noted = [] if source.note is None else [source.note]
-    return [*noted, *_unmeasured(geometry, source), *_cut(wanted, steps)]
-
-
-def _unmeasured(geometry: str | None, source: PoseSource) -> list[str]:
-    if geometry != "nonconvex" or source.shape is not None:
-        return []
-    return [
-        "nonconvex without a shape to start from: a plane only ever touches the convex hull, so what lies between the "
-        "touched points is the start's, not measured; run vision first (`toss-process SESSION`) for a shape"
-    ]
+    found = [] if source.note is None else [source.note]
+    if geometry == "nonconvex" and source.shape is None:
+        found.append(
+            "nonconvex without a shape to start from: a plane only ever touches the convex hull, so what lies between "
+            "the touched points is the start's, not measured; run vision first (`toss-process SESSION`) for a shape"
+        )
+    if wanted != steps:
+        found.append(f"--steps {wanted}: no toss lasts that long; rolled out over {steps}, to the end of the longest")
+    return found
 
 
 def _about(source: PoseSource, given: Physics | None, plane: Plane) -> str:
@@ -222,15 +182,9 @@ def _about(source: PoseSource, given: Physics | None, plane: Plane) -> str:
 
 
 def _learn(
-    train: Sequence[PoseSeries],
-    geometry: str | None,
-    init_m: float | None,
-    source: PoseSource,
-    given: Physics | None,
-    plane: Plane,
-    config: ContactConfig,
-    progress: Progress,
-) -> tuple[ContactLearning, ObjectShape, Mapping[str, Any]]:
+    train: Sequence[PoseSeries], geometry: str | None, init_m: float | None, source: PoseSource, given: Physics | None,
+    plane: Plane, config: ContactConfig, progress: Progress,
+) -> tuple[ContactLearning, ObjectShape, Mapping[str, Any]]:  # fmt: skip
     """From vision's shape (corrected where contact knows better) or from a size alone; the shape, and what else the
     document says."""
     if source.shape is None or init_m is not None or geometry == "box":

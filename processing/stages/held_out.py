@@ -142,11 +142,11 @@ def losses_at(
     world_from_camera: Transform,
 ) -> dict[int, TossLoss]:
     """Contact losses above the plane raised by so much (m)."""
-    from processing.contact.learn.shape_comparison import contact_loss_by
+    from processing.contact.learn.shape_comparison import contact_loss_of
     from processing.contact.physics.plane import Plane
 
     plane = Plane(model.plane_normal_world, model.plane_offset_m + float(raised_m), "the contact model")
-    return contact_loss_by(poses, points_m, model, world_from_camera, plane)
+    return contact_loss_of(poses, points_m, model, world_from_camera, plane)
 
 
 def _listed(tosses: Sequence[int]) -> str:

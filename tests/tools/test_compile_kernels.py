@@ -2,6 +2,9 @@
 
 import ast
 import importlib
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -27,6 +30,19 @@ def test_a_kernel_that_does_not_compile_ends_set_up_with_a_sentence(tool, capfd)
     with pytest.raises(SystemExit, match="could not be compiled"):
         list(tool.side_by_side(["processing.motion.se3_kernels", "processing.no_such_kernels"], jobs=2))
     assert "no_such_kernels" in capfd.readouterr().err
+
+
+def test_what_was_compiled_ahead_is_found_by_the_first_call(tmp_path):
+    """By a process of its own: numba keeps what it compiled by the types of a call."""
+    ahead = "import compile_kernels as c; c.compiled('processing.motion.se3_kernels')"
+    call = (
+        "import numpy as np, processing.motion.se3_kernels as k; k.inverse(np.eye(4));"
+        "print(sum(k.inverse.stats.cache_hits.values()), sum(k.inverse.stats.cache_misses.values()))"
+    )
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path), "PYTHONPATH": f"{ROOT / 'tools'}:{ROOT}"}
+    for code in (ahead, call):
+        done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["1", "0"]
 
 
 def test_every_kernel_is_compiled_ahead_or_called_by_one_that_is(tool):

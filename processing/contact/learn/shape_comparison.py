@@ -27,10 +27,9 @@ from processing.contact.physics.loss import (
     step_terms,
 )
 from processing.contact.physics.plane import Plane
-from processing.contact.physics.support import trimmed_hull
 from processing.motion.trajectory import PoseSeries
 from recordings.geometry import Transform
-from recordings.tracks import ContactModel, ObjectShape, ObjectTrack
+from recordings.tracks import ContactModel, ObjectTrack
 
 CONTACTS = 10
 JUDGING = Weights(dissipation=30.0, penetration=20.0)
@@ -54,30 +53,15 @@ class TossLoss:
 
 def contact_loss_of(
     tracks: Mapping[int, ObjectTrack],
-    shape: ObjectShape | None,
-    model: ContactModel,
-    world_from_camera: Transform,
-    plane: Plane | None = None,
-    weights: Weights = JUDGING,
-) -> dict[int, TossLoss]:
-    """The contact loss per toss of a shape at given poses, with friction and inertia of a model.
-
-    `shape` None: the model's own support points. Lower is better; compare tosses that neither was learned from.
-    Raises BadInput where no toss can be used.
-    """
-    points = model.support_vertices_m if shape is None else trimmed_hull(shape.vertices_m, shape.faces)
-    return contact_loss_by(tracks, points, model, world_from_camera, plane, weights)
-
-
-def contact_loss_by(
-    tracks: Mapping[int, ObjectTrack],
     points: Float[Array, "v 3"],
     model: ContactModel,
     world_from_camera: Transform,
     plane: Plane | None = None,
     weights: Weights = JUDGING,
 ) -> dict[int, TossLoss]:
-    """The same by the points (object frame) that may touch."""
+    """The contact loss per toss at given poses of the points (object frame) that may touch, with friction and inertia
+    of a model. Lower is better; compare tosses that neither was learned from. Raises BadInput where no toss can be
+    used."""
     plane = plane or Plane(model.plane_normal_world, model.plane_offset_m, "the contact model")
     frame = Frame(np.eye(3), model.center_of_mass_m)
     prepared = prepare(series_of(tracks, world_from_camera), frame, plane, _scaled(model))

@@ -1,7 +1,8 @@
 """The inner problem of solver.py, one row after another in compiled code: on a CPU several times faster than batches.
 
 The same Newton iteration with the same line search and the same ends, so that both give the same numbers
-(tests/processing/contact/test_solver.py); the batched form stays for CUDA and as the reference.
+(tests/processing/contact/test_solver.py); the batched form stays for CUDA and as the reference. It also knows how
+A = J M^-1/2 looks (loss.jacobian): of the last three columns row 3c + a has column 3 + a only.
 """
 
 from __future__ import annotations
@@ -48,11 +49,14 @@ def _hessian(A, y, size, epsilon, H, D, DA):
             D[0, 2] = D[2, 0] = 0.5 * ux
             D[1, 2] = D[2, 1] = 0.5 * uy
         for i in range(3):
-            for j in range(6):
+            for j in range(3):
                 DA[i, j] = D[i, 0] * A[3 * c, j] + D[i, 1] * A[3 * c + 1, j] + D[i, 2] * A[3 * c + 2, j]
-        for i in range(6):
+                DA[i, 3 + j] = D[i, j] * A[3 * c + j, 3 + j]
+        for i in range(3):
             for j in range(i + 1):
                 H[i, j] += A[3 * c, i] * DA[0, j] + A[3 * c + 1, i] * DA[1, j] + A[3 * c + 2, i] * DA[2, j]
+            for j in range(4 + i):
+                H[3 + i, j] += A[3 * c + i, 3 + i] * DA[i, j]
     for i in range(6):
         for j in range(i + 1):
             H[i, j] = H[i, j] / epsilon
@@ -118,11 +122,20 @@ def _step(y, Ad, size, v, d, slope, epsilon, flat_enough, search_steps, near, im
 @no_type_check
 def _outward(A, v, q, size, epsilon, y):
     """y = -(A v + q) / epsilon."""
-    for i in range(size):
-        total = q[i]
-        for j in range(6):
-            total += A[i, j] * v[j]
-        y[i] = -total / epsilon
+    for c in range(size // 3):
+        for a in range(3):
+            i = 3 * c + a
+            y[i] = -(q[i] + A[i, 0] * v[0] + A[i, 1] * v[1] + A[i, 2] * v[2] + A[i, 3 + a] * v[3 + a]) / epsilon
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _times(A, d, size, Ad):
+    """Ad = A d."""
+    for c in range(size // 3):
+        for a in range(3):
+            i = 3 * c + a
+            Ad[i] = A[i, 0] * d[0] + A[i, 1] * d[1] + A[i, 2] * d[2] + A[i, 3 + a] * d[3 + a]
 
 
 @njit(cache=True, nogil=True)
@@ -150,9 +163,11 @@ def solve_row(A, q, size, epsilon, v, tolerance, most_iterations, flat_enough, s
         iterations += 1
         size_of_v = size_of_momentum = size_of_gradient = value = 0.0
         momentum[:] = 0.0
-        for i in range(size):
-            for j in range(6):
-                momentum[j] += A[i, j] * impulse[i]
+        for c in range(size // 3):
+            for a in range(3):
+                i = 3 * c + a
+                for j in (0, 1, 2, 3 + a):
+                    momentum[j] += A[i, j] * impulse[i]
         for j in range(6):
             gradient[j] = v[j] - momentum[j]
             size_of_v += v[j] * v[j]
@@ -172,10 +187,7 @@ def solve_row(A, q, size, epsilon, v, tolerance, most_iterations, flat_enough, s
             return True, iterations
         if not np.isfinite(slope):
             return False, iterations
-        for i in range(size):
-            Ad[i] = 0.0
-            for j in range(6):
-                Ad[i] += A[i, j] * d[j]
+        _times(A, d, size, Ad)
         length = _step(y, Ad, size, v, d, slope, epsilon, flat_enough, search_steps, near, impulse)
         for j in range(6):
             v[j] += length * d[j]

@@ -124,9 +124,10 @@ def _solve(A, q, count, primal, impulse, inner, lift):
         change = 0.0
         for c in range(count):
             along, across = q[3 * c], q[3 * c + 1]
-            for j in range(6):
+            for j in range(3):
                 along += A[3 * c, j] * primal[j]
                 across += A[3 * c + 1, j] * primal[j]
+            along, across = along + A[3 * c, 3] * primal[3], across + A[3 * c + 1, 4] * primal[4]
             wanted = (along * along + across * across) ** 0.5
             change = max(change, abs(wanted - lift[c]))
             q[3 * c + 2] += wanted - lift[c]

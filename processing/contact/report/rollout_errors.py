@@ -44,15 +44,8 @@ class Summary:
     count: Float[Array, " t"]
 
     def to_json(self) -> dict[str, Any]:
-        return {
-            "mean": self.mean,
-            "low": self.low,
-            "high": self.high,
-            "per_toss": self.per_toss.tolist(),
-            "curve": self.curve.tolist(),
-            "curve_low": self.curve_low.tolist(),
-            "curve_high": self.curve_high.tolist(),
-        }
+        curves = {name: getattr(self, name).tolist() for name in ("per_toss", "curve", "curve_low", "curve_high")}
+        return {"mean": self.mean, "low": self.low, "high": self.high, **curves}
 
 
 def summarise(errors: Float[Array, "n t"]) -> Summary:

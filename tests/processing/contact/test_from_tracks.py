@@ -192,12 +192,11 @@ def uniform_model(shape, physics, friction, plane):
 def test_the_contact_loss_tells_a_wrong_shape_and_wrong_poses(simulated_tosses):
     tracks = tracks_of(simulated_tosses(4, 130))
     model = uniform_model(noisy_box(), uniform_physics(noisy_box()), 0.25, Plane())
-    held_out = {3: tracks[3]}
-    right = contact_loss_of(held_out, noisy_box(), model, WORLD_FROM_CAMERA)
-    bigger = contact_loss_of(held_out, noisy_box(bigger=1.15), model, WORLD_FROM_CAMERA)
-    shaken = contact_loss_of(
-        {3: tracks_of(simulated_tosses(4, 130), 5, 0.006, 0.04)[3]}, None, model, WORLD_FROM_CAMERA
-    )
+    held_out, moved = {3: tracks[3]}, {3: tracks_of(simulated_tosses(4, 130), 5, 0.006, 0.04)[3]}
+    support, large = (trimmed_hull(s.vertices_m, s.faces) for s in (noisy_box(), noisy_box(bigger=1.15)))
+    right = contact_loss_of(held_out, support, model, WORLD_FROM_CAMERA)
+    bigger = contact_loss_of(held_out, large, model, WORLD_FROM_CAMERA)
+    shaken = contact_loss_of(moved, model.support_vertices_m, model, WORLD_FROM_CAMERA)
     assert set(right) == {3}
     assert abs(right[3].rest_height_m) < 0.003
     assert mean_loss_j(bigger) > 1.3 * mean_loss_j(right)

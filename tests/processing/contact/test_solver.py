@@ -8,8 +8,10 @@ from processing.contact.physics.solver import in_cone, project, project_jacobian
 
 
 def problems(count, contacts, seed):
+    """As J M^-1/2 is (loss.jacobian): what moves the body as a whole moves each point along the same axis alone."""
     rng = np.random.default_rng(seed)
     A = torch.as_tensor(rng.standard_normal((count, contacts, 3, 6)))
+    A[..., 3:] *= torch.eye(3)
     return A, torch.as_tensor(rng.standard_normal((count, contacts, 3)))
 
 
@@ -42,9 +44,9 @@ def test_agrees_with_an_interior_point_solver_to_1e_6(contacts, solve):
     assert not solved.failed.any()
     for i in range(len(A)):
         wanted, impulse = by_clarabel(A[i].numpy(), q[i].numpy(), 1e-3)
-        assert value(A[i].numpy(), q[i].numpy(), 1e-3, solved.impulse[i].numpy()) == pytest.approx(
-            wanted, rel=1e-7, abs=1e-6
-        )
+        reached = value(A[i].numpy(), q[i].numpy(), 1e-3, solved.impulse[i].numpy())
+        assert reached <= wanted + max(1e-6, 1e-7 * abs(wanted))  # among feasible impulses the lower is the better one
+        assert (solved.impulse[i, :, 2] - solved.impulse[i, :, :2].norm(dim=-1)).min() > -1e-9
         np.testing.assert_allclose(solved.impulse[i], impulse, atol=2e-4 * max(1.0, np.abs(impulse).max()))
 
 
