@@ -152,8 +152,9 @@ def _engine(args: argparse.Namespace, first: Path) -> Iterator[Engine]:
     """What computes the stages: this process, several on this machine, or jobs of a cluster."""
     from processing.engine.each import InTurn, SideBySide
     from processing.engine.jobs import chosen_jobs
+    from processing.engine.parts import allow_threads
     from processing.engine.slurm import AT_ONCE, slurm_jobs
-    from processing.engine.workers import Worker
+    from processing.engine.workers import Worker, begin_imports
 
     jobs, why = (args.jobs or AT_ONCE, None) if args.executor == "slurm" else chosen_jobs(args.jobs)
     if why is not None:
@@ -165,6 +166,8 @@ def _engine(args: argparse.Namespace, first: Path) -> Iterator[Engine]:
     elif jobs == 1:
         yield InTurn()
     else:
+        begin_imports()
+        allow_threads(jobs)
         with SideBySide([Worker(board, jobs) for _ in range(jobs)], board) as engine:
             yield engine
 

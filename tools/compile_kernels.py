@@ -19,7 +19,10 @@ from importlib import import_module
 from multiprocessing.connection import Connection, wait
 from typing import Any
 
-TRACK = "processing.track.kernels"
+TRACK, FLIGHT = "processing.track.kernels", "processing.track.flight_kernels"
+CONSISTENCY, APPEARANCE = "processing.track.registration.consistency_kernels", "processing.track.appearance_ratio"
+STEPS, SOLVER = "processing.contact.physics.steps_cpu", "processing.contact.physics.solver_cpu"
+SE3 = "processing.motion.se3_kernels"
 PROFILE = "processing.track.revolution.profile_kernels"
 AZIMUTH = "processing.track.revolution.azimuth_kernels"
 F8, F4, I8 = "float64", "float32", "int64"
@@ -30,10 +33,13 @@ VI, MI, VB, MB = f"{I8}[::1]", f"{I8}[:,::1]", "boolean[::1]", "boolean[:,::1]"
 MOTION = (V, V, VB, V, V, V, F8, V)
 ROLL = (T, M, M, M, VI, M, M, M, F8, I8, I8, F8)
 KERNELS: dict[tuple[str, str], list[tuple[str, ...]]] = {
+    (SE3, "exponential"): [(V,)],
+    (SE3, "inverse"): [(M,)],
     (TRACK, "align_view"): [(M, I8, VI, T, M4, M4, MI, V, V, M, V, M)],
     (TRACK, "graph_terms"): [(T, MI, M4, M4, MI, V, V, V, F8, "boolean", T, M, T, T, M)],
     (TRACK, "view_terms"): [(M, I8, VI, T, M4, M4, MI, V, V, V, M, V)],
     (TRACK, "to_object"): [(M, V, M, F8, M, V)],
+    (FLIGHT, "fit_flights"): [(M, MI, V, V, M4, M4, MI, V, V, M, F8)],
     (PROFILE, "surface_terms"): [(M4, M, M, V, V, VB, VI, V, F8, F8, M, V, M, M, V)],
     (PROFILE, "outline_terms"): [(V4, VI, V, V, M, M, V, V, VB, VI, V, F8, M, V, M, M, V)],
     (PROFILE, "outline_points"): [(M, M, V, V, VB, VI, V, M)],
@@ -44,18 +50,13 @@ KERNELS: dict[tuple[str, str], list[tuple[str, ...]]] = {
     (AZIMUTH, "add_appearance_ratio"): [(Q, T, T, MI, V, F8, F8, I8, M)],
     (AZIMUTH, "add_shape_ratio"): [(T, Q, T, MI, F8, F8, I8, M)],
     (AZIMUTH, "differences"): [(Q, T, MI, VI, I8, F8, M)],
-    ("processing.track.registration.consistency_kernels", "consistency_terms"): [
-        (T, MI, M4, M4, VI, VI, MI, V, V, V, "boolean", T, M, M)
-    ],
-    ("processing.track.flight_kernels", "fit_flights"): [(M, MI, V, V, M4, M4, MI, V, V, M, F8)],
-    ("processing.track.appearance_ratio", "_appearance_at"): [(M4, M, M4, VI, V, V, F8, M)],
-    ("processing.contact.physics.steps_cpu", "roll_rows"): [ROLL],
-    ("processing.contact.physics.solver_cpu", "solve_rows"): [(T, M, F8, M, F8, I8, F8, I8)],
+    (CONSISTENCY, "consistency_terms"): [(T, MI, M4, M4, VI, VI, MI, V, V, V, "boolean", T, M, M)],
+    (APPEARANCE, "_appearance_at"): [(M4, M, M4, VI, V, V, F8, M)],
+    (STEPS, "roll_rows"): [ROLL],
+    (SOLVER, "solve_rows"): [(T, M, F8, M, F8, I8, F8, I8)],
     ("processing.field.fuse", "_integrate"): [
         (T4, T4, T4, T4, T2, T2, Q4, I8, V4, F4, F4, M4, M4, M4, T4, MB, MB, "uint8[:,:,:]", MB)
     ],
-    ("processing.motion.se3_kernels", "exponential"): [(V,)],
-    ("processing.motion.se3_kernels", "inverse"): [(M,)],
     ("processing.sensor.surface_kernel", "fit_surface"): [(M4, MB, V, I8, F8, M4, T4)],
     ("recordings.alignment.kernels", "project"): [(M4, T, V, V, T, M)],
     ("recordings.alignment.kernels", "draw"): [(M4, T, M, M4, V)],
@@ -63,6 +64,8 @@ KERNELS: dict[tuple[str, str], list[tuple[str, ...]]] = {
 }
 """Kernels that Python calls, the slow ones to compile first, with the types that they are called with; what they call
 is compiled with them."""
+CALLS = {TRACK: {SE3}, FLIGHT: {TRACK}, CONSISTENCY: {SE3, TRACK}, APPEARANCE: {SE3}, STEPS: {SOLVER}}
+"""Whose kernels a module's kernels call."""
 
 
 def main() -> int:
@@ -80,39 +83,33 @@ def main() -> int:
 
 
 def side_by_side(modules: list[str], jobs: int) -> Iterator[tuple[str, float]]:
-    """`compiled` of every module, as they end, in so many processes. They are told through pipes: a Pool's locks need a
-    /dev/shm that can be written to."""
+    """`compiled` of every module, as they end, so many at a time. Each has a process of its own that was told how to
+    hash, and begins when what it calls is there: what else a process compiled, and which of two came first, would show
+    in the last digit of what the code computes. They are told through pipes: a Pool's locks need a /dev/shm that can
+    be written to."""
     context = multiprocessing.get_context("spawn")
-    waiting = modules[::-1]
-    busy = []
-    for _ in range(min(jobs, len(modules))):
-        here, there = context.Pipe()
-        context.Process(target=_compiler, args=(there,), daemon=True).start()
-        there.close()
-        here.send(waiting.pop())
-        busy.append(here)
-    while busy:
-        ready = wait(busy)
-        for one in [c for c in busy if c in ready]:
+    os.environ["PYTHONHASHSEED"] = "0"
+    waiting, busy = list(modules), dict[Connection, str]()
+    while waiting or busy:
+        left = {*waiting, *busy.values()}
+        for module in [m for m in waiting if left.isdisjoint(CALLS.get(m, ()))][: jobs - len(busy)]:
+            here, there = context.Pipe(duplex=False)
+            context.Process(target=_compile, args=(module, there), daemon=True).start()
+            there.close()
+            waiting.remove(module)
+            busy[here] = module
+        for one in wait(list(busy)):
             try:
                 done = one.recv()
             except EOFError:
                 raise SystemExit("a kernel could not be compiled; what went wrong stands above") from None
+            del busy[one]
+            one.close()
             yield done
-            if waiting:
-                one.send(waiting.pop())
-            else:
-                busy.remove(one)
-                one.close()
 
 
-def _compiler(orders: Connection) -> None:
-    while True:
-        try:
-            module = orders.recv()
-        except EOFError:
-            return
-        orders.send(compiled(module))
+def _compile(module: str, told: Connection) -> None:
+    told.send(compiled(module))
 
 
 def compiled(module: str) -> tuple[str, float]:

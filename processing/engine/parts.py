@@ -1,4 +1,4 @@
-"""Parts of one stage side by side in threads, for compiled kernels that let go of the interpreter's lock.
+"""Parts of one stage side by side in threads, for work that lets go of the interpreter's lock.
 
 What the parts are is fixed by the work alone and never by the number of threads, so that the bytes are the same for any
 `--jobs`. While other stages keep the cores busy, threads gain nothing and lose nothing.
@@ -6,21 +6,34 @@ What the parts are is fixed by the work alone and never by the number of threads
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
+Item = TypeVar("Item")
 Found = TypeVar("Found")
 _pool: ThreadPoolExecutor | None = None
+_thread = threading.local()
 
 
 def allow_threads(count: int) -> None:
     """How many parts this process computes at a time from now on; one without it."""
     global _pool
-    _pool = ThreadPoolExecutor(count) if count > 1 else None
+    _pool = ThreadPoolExecutor(count, initializer=_of_pool) if count > 1 else None
+
+
+def _of_pool() -> None:
+    _thread.of_pool = True
+
+
+def side_by_side(call: Callable[[Item], Found], items: Sequence[Item]) -> Iterator[Found]:
+    """What `call` gives for each item, in order, as they end. A part's own parts come one after the other: were they
+    waited for, no thread might be left for them."""
+    alone = _pool is None or len(items) < 2 or getattr(_thread, "of_pool", False)
+    return map(call, items) if alone or _pool is None else _pool.map(call, items)
 
 
 def in_parts(call: Callable[[slice], Found], count: int, size: int) -> list[Found]:
     """What `call` gives for each part of `size` (the last may be smaller) of `count` items, in order."""
-    parts = [slice(at, min(at + size, count)) for at in range(0, count, size)]
-    return list(_pool.map(call, parts)) if _pool is not None and len(parts) > 1 else [call(part) for part in parts]
+    return list(side_by_side(call, [slice(at, min(at + size, count)) for at in range(0, count, size)]))

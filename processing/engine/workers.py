@@ -81,6 +81,14 @@ class Worker:
         )
 
 
+def begin_imports() -> None:
+    """Workers' imports begin now, while this process still imports on its own."""
+    from multiprocessing import forkserver
+
+    if _context().get_start_method() == "forkserver":
+        forkserver.ensure_running()
+
+
 def _context() -> Any:
     """Workers are forked from a process that has imported everything and done nothing, where the system can."""
     if not sys.platform.startswith("linux"):
@@ -117,12 +125,9 @@ def _called(call: bytes) -> None:
 
 
 def _quiet() -> None:
-    """As in the command itself: what libraries warn their programmers of is not for a user; and one thread."""
+    """As in the command itself: what libraries warn their programmers of is not for a user."""
     import warnings
 
-    import cv2
-
-    cv2.setNumThreads(1)
     if not sys.warnoptions:
         warnings.simplefilter("ignore")
 

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int64, UInt8
 from numpy import ndarray as Array
 
+from processing.engine.parts import side_by_side
 from processing.evaluate.report_mesh import thinned
 from processing.evaluate.report_shapes import Shown
 from processing.evaluate.table import Row
@@ -45,18 +46,20 @@ class Loop:
 def toss_loops(results: Results, row: Row, session: Session) -> list[Loop]:
     """A loop for every toss of a row whose colour images are there."""
     each = max(FEWEST, FRAMES // max(len(row.tracks), 1))
-    loops = []
-    shapes: dict[str | None, ObjectShape] = {}
-    for toss, track in row.tracks.items():
-        stage = row.record.toss(toss).shape or row.record.shape
-        if stage not in shapes:
-            shapes[stage] = _outline_shape(results, row, toss)
-        images = loop_images(session, row, track, shapes[stage], each)
-        if images:
-            shown = chosen_frames(track, each)
-            times_s = SLOWED * 1e-9 * (track.time_ns[shown] - track.time_ns[shown[0]]).astype(np.float64)
-            loops.append(Loop(toss, looping_webp(images, times_s, QUALITY), len(images)))
-    return loops
+    stages = {toss: row.record.toss(toss).shape or row.record.shape for toss in row.tracks}
+    a_toss = {stage: toss for toss, stage in stages.items()}
+    shapes = {stage: _outline_shape(results, row, toss) for stage, toss in a_toss.items()}
+
+    def loop(toss: int) -> Loop | None:
+        track = row.tracks[toss]
+        images = loop_images(session, row, track, shapes[stages[toss]], each)
+        if not images:
+            return None
+        shown = chosen_frames(track, each)
+        times_s = SLOWED * 1e-9 * (track.time_ns[shown] - track.time_ns[shown[0]]).astype(np.float64)
+        return Loop(toss, looping_webp(images, times_s, QUALITY), len(images))
+
+    return [found for found in side_by_side(loop, list(row.tracks)) if found is not None]
 
 
 def loop_images(

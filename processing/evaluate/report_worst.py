@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray as Array
 
+from processing.engine.parts import side_by_side
 from processing.evaluate.score import TossScore
 from processing.evaluate.table import Row
 from processing.motion.frame_phases import Phase
@@ -57,7 +58,7 @@ class Worst:
 
 def worst_frames(results: Results, row: Row) -> list[Worst]:
     """The worst frames of a row, worst first: runs of lost ones (a half of them at most), then by error or fit."""
-    every = {toss: diagnostics(results, row, toss) for toss in row.tracks}
+    every = dict(zip(row.tracks, side_by_side(lambda toss: diagnostics(results, row, toss), list(row.tracks))))
     lost = sorted(((b - a, t, a) for t, e in every.items() for a, b in runs(e.track.lost)), reverse=True)
     found = [_lost(every[t], a, a + n) for n, t, a in lost[: WORST // 2]]
     ranked = sorted(

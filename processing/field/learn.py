@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Int64
 from numpy import ndarray as Array
 
+from processing.engine.parts import side_by_side
 from processing.field.mesh import extract_mesh
 from processing.field.train import FieldConfig, train_field
 from processing.field.views import FieldView, make_view
@@ -66,7 +67,8 @@ def chosen_views(tosses: Sequence[TossViews], camera: CameraModel, config: Learn
     chosen = (
         [places[i] for i in np.unique(np.linspace(0, len(places) - 1, config.most_views).astype(int))] if places else []
     )
-    views = [view for toss, i in chosen if (view := _view(toss, i, camera)) is not None]
+    found = side_by_side(lambda place: _view(place[0], place[1], camera), chosen)
+    views = [view for view in found if view is not None]
     if not views:
         raise BadInput("no tracked frame shows the object, so there is nothing to learn a shape from")
     return views

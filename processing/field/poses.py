@@ -12,10 +12,14 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from processing.engine.parts import in_parts
 from processing.field.network import ObjectField
 from processing.field.rays import RayDataset
 from processing.sensor.noise import PUBLISHED, DepthNoise
 from recordings.constants import LUMA
+
+PART = 2**15
+"""Points in one part of the work."""
 
 
 @dataclass(frozen=True)
@@ -58,10 +62,15 @@ def refine_poses(
 
 def _with_gradient(function: Callable[[Tensor], Tensor], points: Tensor) -> tuple[Tensor, Tensor]:
     """Values (n,) of a function of points and their gradients (n, 3)."""
-    points = points.detach().requires_grad_(True)
-    values = function(points)
-    (gradient,) = torch.autograd.grad(values.sum(), points)
-    return values.detach(), gradient
+
+    def of_some(some: slice) -> tuple[Tensor, Tensor]:
+        chosen = points[some].detach().requires_grad_(True)
+        values = function(chosen)
+        (gradient,) = torch.autograd.grad(values.sum(), chosen)
+        return values.detach(), gradient
+
+    values, gradients = zip(*in_parts(of_some, len(points), PART), strict=True)
+    return torch.cat(values), torch.cat(gradients)
 
 
 def _draw(dataset: RayDataset, views: int, most: int) -> Tensor:

@@ -15,8 +15,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-import cv2
-
 from processing.config import Config
 from processing.live import bounds
 from processing.live.config import LiveConfig
@@ -156,7 +154,6 @@ class _Follower:
     side: SideWork[LawSoFar] = field(default_factory=SideWork)
 
     def until_end(self) -> Followed:
-        cv2.setNumThreads(1)
         self._state("waiting")
         self._say("ready", "live: ready; each toss is looked at when it is recorded")
         if self.together.world_from_camera is None:

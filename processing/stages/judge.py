@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from processing.engine.parts import side_by_side
 from processing.images import Images, track_and_image_keys
 from processing.refine.image_residuals import Explained, explain, pooled
 from processing.run import Run
@@ -38,13 +39,16 @@ def judge(
     inputs = {**{f"shape_{t:02d}": s.key for t, s in shapes.items()}, **track_and_image_keys(tracks, images)}
 
     def compute(folder: Path) -> JudgeResult:
-        parts: list[Explained] = []
-        progress = run.progress(f"{name}: residuals on the raw images")
-        for done, toss in enumerate(tracks):
-            progress.step(done, len(tracks), f"toss {toss}")
+        def explained(toss: int) -> Explained:
             body, track = read_shape(shapes[toss].folder), read_track(tracks[toss].folder, toss)
             seen = images[toss].open()
-            parts.append(explain(body, track, seen.frames, seen.masks, run.camera, run.config.cycle.judge))
+            return explain(body, track, seen.frames, seen.masks, run.camera, run.config.cycle.judge)
+
+        parts: list[Explained] = []
+        progress = run.progress(f"{name}: residuals on the raw images")
+        for part in side_by_side(explained, list(tracks)):
+            parts.append(part)
+            progress.step(len(parts), len(tracks), "")
         every = pooled(parts)
         with open(folder / "residuals.npz", "wb") as out:
             np.savez(out, rows=every.rows)

@@ -9,11 +9,13 @@ from pathlib import Path
 import numpy as np
 
 from processing.backends import matcher_of
+from processing.engine.parts import side_by_side
 from processing.images import Images
 from processing.run import Run, matcher_settings
 from processing.store import Done
 from processing.track.registration.register import register_tosses
 from processing.track.track_file import read_toss_track
+from processing.track.track_toss import TossTrack
 from recordings.results.folder import write_track
 from recordings.tracks import ObjectTrack
 
@@ -39,11 +41,12 @@ def register(
     inputs = {f"track_{t:02d}": tracks[t].key for t in tracks}
 
     def compute(folder: Path) -> RegisterResult:
-        tosses = []
-        for toss, done in tracks.items():
+        def opened(toss: int) -> TossTrack:
             seen = images[toss].open()
-            tosses.append(read_toss_track(done.folder, toss, seen.frames, seen.masks, run.camera, seen.confidence,
-                                          run.config.track, run.world_from_camera))  # fmt: skip
+            return read_toss_track(tracks[toss].folder, toss, seen.frames, seen.masks, run.camera, seen.confidence,
+                                   run.config.track, run.world_from_camera)  # fmt: skip
+
+        tosses = list(side_by_side(opened, list(tracks)))
         matcher = matcher_of(run.config.backends, run.device)
         found = register_tosses(
             tosses, run.config.register, run.progress("one object frame"), matcher, together=together

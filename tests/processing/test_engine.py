@@ -22,7 +22,7 @@ import pytest
 from processing.engine import jobs
 from processing.engine.each import InTurn, SideBySide, Task
 from processing.engine.outcome import Fault, Lost, Outcome, outcome_of, raise_outcome
-from processing.engine.parts import allow_threads, in_parts
+from processing.engine.parts import allow_threads, in_parts, side_by_side
 from processing.engine.workers import Worker
 from processing.store import Store
 from recordings.errors import BadInput, TosslabError, WriteFailed
@@ -369,6 +369,13 @@ def test_what_fails_in_a_part_fails_as_it_would_alone(threads: Callable[[int], N
         threads(count)
         with pytest.raises(BadInput, match="no depth here"):
             in_parts(fails, 3, 1)
+
+
+def test_parts_of_a_part_wait_for_no_thread(threads: Callable[[int], None]) -> None:
+    """All threads are busy with the outer parts; inner ones that waited for a thread would wait for ever."""
+    threads(2)
+    found = side_by_side(lambda n: list(side_by_side(lambda m: n * m, [1, 2, 3])), [1, 2, 3, 4])
+    assert list(found) == [[n, 2 * n, 3 * n] for n in (1, 2, 3, 4)]
 
 
 def test_two_jobs_leave_the_same_bytes_as_one(record_tiny: Any, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 import ast
 import importlib
+import inspect
 import os
 import subprocess
 import sys
@@ -43,6 +44,19 @@ def test_what_was_compiled_ahead_is_found_by_the_first_call(tmp_path):
     for code in (ahead, call):
         done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["1", "0"]
+
+
+def test_a_module_waits_for_those_whose_kernels_it_calls(tool):
+    modules = {module for module, _ in tool.KERNELS}
+    called = {}
+    for module in modules:
+        foreign = {
+            f.py_func.__module__ for f in vars(importlib.import_module(module)).values() if hasattr(f, "py_func")
+        }
+        named = {v.__name__ for v in vars(importlib.import_module(module)).values() if inspect.ismodule(v)}
+        if found := (foreign | named & modules) - {module}:
+            called[module] = found
+    assert called == tool.CALLS
 
 
 def test_every_kernel_is_compiled_ahead_or_called_by_one_that_is(tool):

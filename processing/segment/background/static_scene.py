@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 from numpy import ndarray as Array
 
+from processing.engine.parts import in_parts
 from processing.segment.background.moving_camera import refuse_moving_camera
 from processing.sensor.noise import stereo_sigma_m
 from recordings.constants import MAD_TO_SIGMA_SHORT
@@ -115,13 +117,14 @@ def learn_scene(
     height, width = depths[0].shape
     table = np.zeros((height, width), dtype=np.float32) if table_depth_m is None else table_depth_m
     refuse_moving_camera(colors, hidden)
-    rows = []
-    for i in range(0, height, 40):
-        part = slice(i, i + 40)
+
+    def learn_rows(part: slice) -> Any:
         covered = np.zeros((len(depths), len(depths[0][part]), width), dtype=bool)
         if hidden is not None:
             covered = np.stack([h[part] for h in hidden])
-        rows.append(_learn_rows([c[part] for c in colors], [d[part] for d in depths], covered, table[part], settings))
+        return _learn_rows([c[part] for c in colors], [d[part] for d in depths], covered, table[part], settings)
+
+    rows = in_parts(learn_rows, height, 40)
     depth, sigma, color, color_sigma, known, share = (np.concatenate(part) for part in zip(*rows))
     never_bare = np.zeros_like(known)
     for first, last in _ends(tosses, len(depths)):

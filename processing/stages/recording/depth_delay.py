@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from processing.engine.parts import side_by_side
 from processing.run import CAMERA, Run
 from processing.segment.background.depth_delay import OutlineShifts, delay_of, outline_shifts, significant_delay
 from processing.segment.background.static_scene import StaticScene
@@ -38,11 +39,12 @@ def with_depth_in_time(run: Run, scene: Done, masks: Mapping[int, Done]) -> Run:
     inputs = {"scene": scene.key, **{f"masks_{t:02d}": done.key for t, done in masks.items()}}
 
     def compute(folder: Path) -> DepthDelayResult:
-        learned, seen, stamps_s = StaticScene.read(scene.folder), [], []
-        for t, done in masks.items():
-            frames = run.session.toss(t).rgbd(CAMERA)
-            seen.append(outline_shifts(frames, read_masks(done.folder, t), learned, settings))
-            stamps_s.append((frames.depth_times_ns - frames.times_ns) * 1e-9)
+        learned = StaticScene.read(scene.folder)
+        frames = {t: run.session.toss(t).rgbd(CAMERA) for t in masks}
+        seen = list(side_by_side(
+            lambda t: outline_shifts(frames[t], read_masks(masks[t].folder, t), learned, settings), list(masks)
+        ))  # fmt: skip
+        stamps_s = [(f.depth_times_ns - f.times_ns) * 1e-9 for f in frames.values()]
         stamped_s = float(np.median(np.concatenate(stamps_s)))
         found = delay_of(OutlineShifts.joined(seen), settings)
         added_s = significant_delay(found, stamped_s, settings)

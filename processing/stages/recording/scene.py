@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from processing.engine.parts import side_by_side
 from processing.run import CAMERA, Run
 from processing.scene_frames import background_keys, hidden_by_robot, read, scene_frames
 from processing.segment.background.static_scene import (
@@ -51,9 +52,9 @@ def _learn(run: Run, folder: Path) -> SceneResult:
     progress = run.progress("static scene")
 
     def frames() -> Iterator[RgbdFrame]:
-        for done, at in enumerate(found.chosen):
+        for done, frame in enumerate(side_by_side(lambda at: read(found, at), found.chosen)):
             progress.step(done, len(found.chosen))
-            yield read(found, at)
+            yield frame
 
     hidden = hidden_by_robot(run, [(t, int(found.streams[t].times_ns[i])) for t, i in found.chosen])
     table = calibrated_table_depth(run.session.calibration, CAMERA)

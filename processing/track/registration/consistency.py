@@ -7,6 +7,7 @@ The inconsistency among the views of one toss is taken off: masks and poses are 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -16,7 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 from numpy import ndarray as Array
 
-from processing.engine.parts import in_parts
+from processing.engine.parts import in_parts, side_by_side
 from processing.motion.rotation_grid import all_turns
 from processing.sensor import view_layout as lay
 from processing.sensor.view_store import ViewStore
@@ -206,14 +207,26 @@ class Inconsistency:
 
     def fitted(self, found: list[Fit]) -> list[Fit]:
         """Placements aligned and judged, different ones only, best first."""
-        coarse = [self.aligned(f.first_from_own, self.config.coarse) for f in found]
-        rough = distinct([Fit(x, self.cost(x)) for x in coarse])[: self.config.kept]
-        return self.judged(rough)
+        rough = self._all_aligned([f.first_from_own for f in found], self.config.coarse)
+        return self.judged(rough[: self.config.kept])
 
     def judged(self, found: list[Fit]) -> list[Fit]:
         """Placements that are nearly right aligned finely and judged, best first."""
-        fine = [self.aligned(f.first_from_own, self.config.fine, grounded=True) for f in found]
-        return distinct([Fit(x, self.cost(x)) for x in fine])
+        return self._all_aligned([f.first_from_own for f in found], self.config.fine, grounded=True)
+
+    def _all_aligned(
+        self, starts: Sequence[Float[Array, "4 4"]], schedule: Schedule, *, grounded: bool = False
+    ) -> list[Fit]:
+        """Where several starts lead, different placements only, best first."""
+        if not starts:
+            return []
+        _ = self.pairs, self.itself, self.unlike  # all starts need them: made before threads ask for them
+
+        def fit(start: Float[Array, "4 4"]) -> Fit:
+            there = self.aligned(start, schedule, grounded=grounded)
+            return Fit(there, self.cost(there))
+
+        return distinct(list(side_by_side(fit, starts)))
 
     def all_around(self) -> list[Fit]:
         """Placements sought over all rotations about the two sides' surface centers, the best few, best first."""
@@ -221,13 +234,11 @@ class Inconsistency:
         thin = Inconsistency(replace(self.both, mine=_some(self.both.mine, self.config.seek_views),
                                theirs=_some(self.both.theirs, self.config.seek_views)), self.rims, few)  # fmt: skip
         center_own_m, center_common_m = self.both.surface_centers_m()
-        found = []
-        for turn in all_turns(self.config.turns):
-            start = np.eye(4)
-            start[:3, :3], start[:3, 3] = turn, center_common_m - turn @ center_own_m
-            there = thin.aligned(start, self.config.seek)
-            found.append(Fit(there, thin.cost(there)))
-        return distinct(found)[: self.config.tried]
+        turns = all_turns(self.config.turns)
+        starts = np.tile(np.eye(4), (len(turns), 1, 1))
+        starts[:, :3, :3] = turns
+        starts[:, :3, 3] = [center_common_m - turn @ center_own_m for turn in turns]
+        return thin._all_aligned(list(starts), self.config.seek)[: self.config.tried]
 
     @cached_property
     def pairs(self) -> Int[Array, "m 2"]:

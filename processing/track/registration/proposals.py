@@ -4,12 +4,13 @@ see the same side."""
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray as Array
 
-from processing.engine.parts import in_parts
+from processing.engine.parts import in_parts, side_by_side
 from processing.features.sift import FeatureMatcher, Features, RansacConfig, relative_motions
 from processing.motion import se3_kernels as se3
 from processing.track import kernels as k
@@ -67,9 +68,9 @@ def by_features(
     """Different registrations that feature matches support, aligned, best first (cost: mean over pairs of views that
     see the same side, 0 perfect .. 1), and whether the matches make the first certain."""
     proposals, votes = _proposed(both, features, matcher, config)
-    rough = [_aligned(both, p, config.coarse, config.pairs // 2, config) for p in proposals]
-    good = distinct(rough)[: config.kept]
-    found = distinct([_aligned(both, r.first_from_own, config.fine, config.pairs, config) for r in good])
+    rough = list(side_by_side(lambda p: _aligned(both, p, config.coarse, config.pairs // 2, config), proposals))
+    good = [f.first_from_own for f in distinct(rough)[: config.kept]]
+    found = distinct(list(side_by_side(lambda p: _aligned(both, p, config.fine, config.pairs, config), good)))
     second = max(votes[1:], default=0.0)
     sure = bool(votes) and votes[0] >= config.sure_votes and second < 0.5 * votes[0]
     return found, sure and bool(found) and found[0].cost <= config.uncertain_cost
@@ -80,9 +81,9 @@ def _proposed(
 ) -> tuple[list[Float[Array, "4 4"]], list[float]]:
     """Transforms that feature matches between keyframes support, the most supported first, near copies merged, and how
     many matches support each."""
-    for i in (*both.mine, *both.theirs):
-        if int(i) not in features:
-            features[int(i)] = matcher.describe(both.keyframes.store, int(i))
+    new = [i for i in map(int, (*both.mine, *both.theirs)) if i not in features]
+    describe = partial(matcher.describe, both.keyframes.store)
+    features |= zip(new, side_by_side(describe, new) if matcher.side_by_side else map(describe, new), strict=True)
 
     def moved(some: slice) -> list[tuple[float, Float[Array, "4 4"]]]:
         """By the matches of some views of the toss with all views of the others."""

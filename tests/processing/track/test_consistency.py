@@ -129,9 +129,11 @@ def test_two_threads_compare_views_and_match_features_to_the_same_bytes_as_one()
             against = inconsistency(prism(SLENDER, 0.166, None), apart=False)
             terms = against._terms(against.both.poses(np.eye(4)), against.pairs, rows(CONFIG.fine, 1.0)[0])
             proposed, sure = by_features(against.both, {}, Sift(), ProposeConfig())
+            fitted = against.fitted([Fit(FIRST_FROM_OWN, 0.0), Fit(np.eye(4), 0.0)])
         finally:
             allow_threads(1)
-        found.append((*(x.tobytes() for x in terms), [(p.first_from_own.tobytes(), p.cost) for p in proposed], sure))
+        placed = [(p.first_from_own.tobytes(), p.cost) for p in (*proposed, *fitted)]
+        found.append((*(x.tobytes() for x in terms), placed, sure))
     assert len(against.pairs) > PART
     assert found[0] == found[1]
 
