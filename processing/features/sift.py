@@ -87,12 +87,17 @@ class Sift:
         return Features(points[has_depth], descriptors[has_depth])
 
     def match(self, one: Features, other: Features) -> Int[Array, "m 2"]:
-        if len(one.descriptors) < 2 or len(other.descriptors) < 2:
+        a, b = one.descriptors, other.descriptors
+        if len(a) < 2 or len(b) < 2:
             return np.zeros((0, 2), dtype=np.int64)
-        near = cv2.BFMatcher(cv2.NORM_L2).knnMatch(one.descriptors, other.descriptors, k=2)
-        kept = [(a.distance / max(b.distance, 1e-6), a.queryIdx, a.trainIdx) for a, b in near]
-        kept = sorted(m for m in kept if m[0] < self.config.ratio)
-        return np.array([m[1:] for m in kept], dtype=np.int64).reshape(-1, 2)
+        squared = (a * a).sum(1)[:, None] + (b * b).sum(1) - 2 * (a @ b.T)  # exact: whole numbers below 2^24
+        nearest = squared.argmin(1)
+        first = squared[np.arange(len(a)), nearest]
+        squared[np.arange(len(a)), nearest] = np.inf
+        ratio = np.sqrt(first).astype(np.float64) / np.maximum(np.sqrt(squared.min(1)), np.float32(1e-6))
+        kept = np.flatnonzero(ratio < self.config.ratio)
+        kept = kept[np.argsort(ratio[kept], kind="stable")]
+        return np.stack([kept, nearest[kept]], axis=1)
 
 
 def _tight(crop: Crop, rim: int = 4) -> tuple[Float[Array, "2"], Array, Array]:

@@ -286,3 +286,18 @@ def test_a_file_of_other_layers_is_refused(name: str, tmp_path: Path) -> None:
     torch.save({"some.weight": torch.zeros(2)}, tmp_path / file)
     with pytest.raises(BadInput, match=f"holds other layers: no .* more; wanted: {file}.*{source}"):
         backend.from_weights(tmp_path)
+
+
+def test_sift_takes_the_matches_that_opencvs_brute_force_finds() -> None:
+    rng = np.random.default_rng(2)
+    one = rng.integers(0, 150, (80, 128)).astype(np.float32)
+    other = np.concatenate(
+        [np.clip(one[:50] + rng.integers(-40, 40, (50, 128)), 0, 255), one[:5], rng.integers(0, 150, (40, 128))]
+    )
+    two = other.astype(np.float32)
+    near = cv2.BFMatcher(cv2.NORM_L2).knnMatch(one, two, k=2)
+    wanted = sorted((a.distance / max(b.distance, 1e-6), a.queryIdx, a.trainIdx) for a, b in near)
+    matcher = Sift()
+    found = matcher.match(Features(np.zeros((80, 3)), one), Features(np.zeros((95, 3)), two))
+    assert 20 < len(found) < 80
+    assert found.tolist() == [[q, t] for ratio, q, t in wanted if ratio < matcher.config.ratio]
