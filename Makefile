@@ -7,6 +7,7 @@ STAMP := .venv/.installed
 BASE := .venv/.installed-base
 OUT := out/demo
 SAMPLE := recordings/samples/box_toss
+export PIP_DISABLE_PIP_VERSION_CHECK := 1
 EXTRAS := dev,sim,learned,rig-realsense,rig-franka,rig-ur
 
 .PHONY: setup demo test test-all check bench blender variety
@@ -17,6 +18,7 @@ $(BASE): pyproject.toml constraints.txt
 	@test -n "$(PYTHON)" || { echo "no Python 3.11, 3.12 or 3.13 found; as root, type: apt-get update && apt-get install -y python3-venv" >&2; exit 1; }
 	test -x $(BIN)/pip || $(PYTHON) tools/make_venv.py .venv
 	$(BIN)/python tools/check_system.py --for demo --bring .venv
+	@echo "installing packages, gigabytes of them: pip says nothing meanwhile, for minutes"
 	# torch first and pinned: otherwise another package pulls the newest CUDA build, several gigabytes
 	$(BIN)/python -m pip install -q torch==2.13.0 -c constraints.txt
 	$(BIN)/python -m pip install -q -e . -c constraints.txt
@@ -25,6 +27,7 @@ $(BASE): pyproject.toml constraints.txt
 
 $(STAMP): $(BASE)
 	$(BIN)/python tools/check_system.py --for test --bring .venv
+	@echo "installing what the tests need: pip says nothing meanwhile"
 	$(BIN)/python -m pip install -q -e ".[$(EXTRAS)]" -c constraints.txt
 	touch $@
 
