@@ -68,7 +68,13 @@ class _Camera(SimulatedDevice):
 
     def _skip_lost(self) -> None:
         """Frames that were not read in time, were lost on the way, or were never exposed."""
-        stage, config = self._lab.stage, self._lab.config
+        stage, config, now_ns = self._lab.stage, self._lab.config, time.monotonic_ns()
+        for kind in ("silence", "lost_trigger"):  # also where nobody asked while it lasted: this thread may come late
+            while (exposed_ns := stage.exposed_ns(self._streams[0], self._frame)) < now_ns:
+                if self._faults.active(kind, exposed_ns) is None:
+                    break
+                self._missed_triggers += kind == "lost_trigger"
+                self._frame += 1
         newest = stage.frame_before(time.monotonic_ns() - round(self._latency_ms * 1e6))
         quiet = self._faults.active("lost_trigger") or self._faults.active("silence")
         if quiet and newest > self._frame:

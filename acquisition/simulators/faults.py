@@ -60,13 +60,13 @@ class Faults:
         with self._lock:
             self._planned = [fault for fault in self._planned if fault.kind != kind]
 
-    def active(self, kind: str) -> Fault | None:
-        """The fault of this kind that holds now, if any."""
+    def active(self, kind: str, at_ns: int | None = None) -> Fault | None:
+        """The fault of this kind that holds now, or held at a time (time.monotonic_ns), if any."""
         if not self._planned:
             return None
-        now_ns = time.monotonic_ns()
+        when_ns = time.monotonic_ns() if at_ns is None else at_ns
         with self._lock:
-            return next((fault for fault in self._planned if fault.kind == kind and fault.active(now_ns)), None)
+            return next((fault for fault in self._planned if fault.kind == kind and fault.active(when_ns)), None)
 
     def take(self, kind: str) -> Fault | None:
         """As `active`, and forgotten: for what happens once."""
