@@ -30,8 +30,8 @@ def _of_pool() -> None:
 def side_by_side(call: Callable[[Item], Found], items: Sequence[Item]) -> Iterator[Found]:
     """What `call` gives for each item, in order, as they end. A part's own parts come one after the other: were they
     waited for, no thread might be left for them."""
-    alone = _pool is None or len(items) < 2 or getattr(_thread, "of_pool", False)
-    return map(call, items) if alone or _pool is None else _pool.map(call, items)
+    pool = None if len(items) < 2 or getattr(_thread, "of_pool", False) else _pool
+    return map(call, items) if pool is None else pool.map(call, items)
 
 
 def in_parts(call: Callable[[slice], Found], count: int, size: int) -> list[Found]:

@@ -46,9 +46,9 @@ def judge(
 
         parts: list[Explained] = []
         progress = run.progress(f"{name}: residuals on the raw images")
-        for part in side_by_side(explained, list(tracks)):
+        for toss, part in zip(tracks, side_by_side(explained, list(tracks)), strict=True):
             parts.append(part)
-            progress.step(len(parts), len(tracks), "")
+            progress.step(len(parts), len(tracks), f"toss {toss}")
         every = pooled(parts)
         with open(folder / "residuals.npz", "wb") as out:
             np.savez(out, rows=every.rows)
