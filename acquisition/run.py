@@ -32,7 +32,7 @@ from recordings.records import HealthLine, TossEvent
 from recordings.session_writer import SessionWriter, toss_name
 from recordings.tracks import RigCalibration
 
-SLOW_S = 2.0
+SLOW_S, AGAIN_S = 2.0, 10.0
 
 
 @dataclass(frozen=True)
@@ -218,14 +218,16 @@ class SessionRun:
         return False
 
     def _close(self) -> None:
-        """Wait for the queues; stays answerable to Ctrl-C, and says so when the disk keeps everybody waiting."""
+        """Wait for the queues; stays answerable to Ctrl-C, and says what keeps everybody waiting."""
         self.recorder.end()
         self._ended_host_ns = time.monotonic_ns()
         next_warning_s = time.monotonic() + SLOW_S
         while not self.recorder.ended():
             if time.monotonic() > next_warning_s:
-                self.operator.say("the disk is slow: still writing what was recorded")
-                next_warning_s += SLOW_S
+                topic, many = self.recorder.most_waiting()
+                seen = f"still writing what was recorded, {many} of {topic} wait"
+                self.operator.say(f"{seen}: the disk is slow, or the cores are busy with something else")
+                next_warning_s += AGAIN_S
             time.sleep(POLL_S)
 
     def _counts(self, before: Mapping[str, Tally]) -> dict[str, Tally]:

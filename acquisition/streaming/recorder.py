@@ -137,6 +137,10 @@ class Recorder:
         self._take = None
         return True
 
+    def most_waiting(self) -> tuple[str, int]:
+        """The stream for which most is still to be written, and how much."""
+        return max(((topic, queue.waiting) for topic, queue in self.queues.items()), key=lambda found: found[1])
+
     @property
     def take(self) -> Take | None:
         return self._take

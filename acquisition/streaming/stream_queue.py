@@ -84,6 +84,11 @@ class StreamQueue:
         return not self._thread.is_alive()
 
     @property
+    def waiting(self) -> int:
+        """Items that were received and are not worked off."""
+        return len(self._queue)
+
+    @property
     def fullest(self) -> int:
         return self._queue.fullest
 

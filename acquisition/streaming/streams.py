@@ -107,6 +107,10 @@ class BoundedQueue(Generic[T]):
         self._closed = False
         self.fullest = 0
 
+    def __len__(self) -> int:
+        with self._ready:
+            return len(self._items)
+
     def offer(self, item: T) -> bool:
         """False where the queue is full: the item was not taken."""
         with self._ready:

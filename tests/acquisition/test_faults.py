@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import re
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -187,6 +188,24 @@ def test_a_slow_disk_costs_counted_frames_and_never_holds_a_driver(
         assert "queue full" in done.take.verdict.text()
     assert all(not t.missed for t in done.take.counts.values())
     assert_everything_is_counted(done)
+
+
+def test_what_keeps_a_finished_take_waiting_is_said_once_in_ten_seconds(
+    record: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The disk stalls for five seconds just before the take's end, with all that comes behind it in the queues."""
+    plain, stalls = Sink._write, [time.monotonic() + 1.2]
+
+    def stalled(self: Sink, data: memoryview) -> None:
+        if self.path.name.startswith("toss") and stalls and time.monotonic() > stalls[0]:
+            stalls.clear()
+            time.sleep(5.0)
+        plain(self, data)
+
+    monkeypatch.setattr(Sink, "_write", stalled)
+    said = [text for text in record(seconds=1.0).operator.told if "still writing" in text]
+    assert len(said) == 1
+    assert re.search(r"still writing what was recorded, [1-9]\d* of /\S+ wait: the disk is slow, or the cores", said[0])
 
 
 @pytest.mark.slow
