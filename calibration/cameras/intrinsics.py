@@ -127,7 +127,7 @@ def _open_print(fit: Fit, views: Sequence[TargetView]) -> Solved:
     """The views with the board's marks free to lie elsewhere, which judges the board: a bent or wrongly printed one."""
     numbers = [v for v in range(len(views)) if v not in fit.rejected]
     board_m = float(np.linalg.norm(np.ptp(np.concatenate([views[v].points_m for v in numbers]), axis=0)))
-    return fit_lens(fit.model, views, numbers, max(PRINT_M, FLATNESS * board_m))[0]
+    return fit_lens(fit.model, views, numbers, fit.k3_held, max(PRINT_M, FLATNESS * board_m))[0]
 
 
 def _kept(camera: str, given: CameraModel, fit: Fit, opened: Solved, views: Sequence[TargetView]) -> Lens | None:

@@ -11,7 +11,7 @@ from numpy import ndarray as Array
 
 from calibration.cameras.bundle import Observations, Scene, Solved, adjust
 from calibration.cameras.extrinsics import bad_views, board_pose, whitening
-from calibration.cameras.lens_prior import has_k3, with_weighed_k3
+from calibration.cameras.lens_prior import has_k3, k3_share, with_weighed_k3
 from calibration.cameras.targets import TargetView, numbered_marks
 from recordings.errors import BadInput
 from recordings.geometry import CameraModel
@@ -31,13 +31,15 @@ one-standard-error rule: Breiman et al., Classification and Regression Trees, 19
 class Fit:
     """A lens fitted to views. `aside_px2`: by the number of each view, the mean square of what a lens fitted without it
     left of a coordinate there, the board's pose found anew; of rejected views as well, for what one lens cannot explain
-    another may. `hold_out_px`: root mean square of the others."""
+    another may. `hold_out_px`: root mean square of the others. `k3_held`: Brown's k3, where there is one, is held
+    back."""
 
     solved: Solved
     seen: Observations
     rejected: tuple[int, ...]
     aside_px2: Mapping[int, float]
     hold_out_px: float
+    k3_held: bool
 
     @property
     def model(self) -> CameraModel:
@@ -45,31 +47,47 @@ class Fit:
 
     @staticmethod
     def of(start: CameraModel, views: Sequence[TargetView]) -> Fit:
+        """With Brown's k3 held back; or free, where views tell it better than what is known of lenses, and it leaves
+        less of those kept aside."""
+        held = Fit.by(start, views, k3_held=True)
+        if not has_k3(start):
+            return held
+        free = Fit.by(start, views, k3_held=False)
+        told = k3_share(free.model, float(free.solved.std("lens", 0)[-1])) > 0.5
+        return free if told and gain_by_chance(free.aside_px2, held.aside_px2) > 0 else held
+
+    @staticmethod
+    def by(start: CameraModel, views: Sequence[TargetView], k3_held: bool) -> Fit:
         """All views, then without those that do not fit; and each quarter of them kept aside once."""
-        solved, seen = fit_lens(start, views, range(len(views)))
+
+        def fitted(first: CameraModel, numbers: Sequence[int]) -> tuple[Solved, Observations]:
+            return fit_lens(first, views, numbers, k3_held)
+
+        solved, seen = fitted(start, range(len(views)))
         rejected = tuple(v for _, v in bad_views(solved, seen))
         numbers = [v for v in range(len(views)) if v not in rejected]
         if rejected and len(numbers) >= LEAST_VIEWS:
-            solved, seen = fit_lens(start, views, numbers)
+            solved, seen = fitted(start, numbers)
         else:
             rejected, numbers = (), list(range(len(views)))
         squares: dict[int, Float[Array, "n 2"]] = {}
         for fold in range(FOLDS):
             aside = numbers[fold::FOLDS]
-            rest, _ = fit_lens(solved.scene.models[0], views, [v for v in numbers if v not in aside])
+            rest, _ = fitted(solved.scene.models[0], [v for v in numbers if v not in aside])
             squares |= squares_aside(rest.scene.models[0], views, aside)
         hold_out = float(np.sqrt(np.concatenate([*squares.values()]).mean()))
         if rejected:
             squares |= squares_aside(solved.scene.models[0], views, rejected)
-        return Fit(solved, seen, rejected, {v: float(q.mean()) for v, q in squares.items()}, hold_out)
+        return Fit(solved, seen, rejected, {v: float(q.mean()) for v, q in squares.items()}, hold_out, k3_held)
 
 
 def fit_lens(
-    start: CameraModel, views: Sequence[TargetView], numbers: Sequence[int], print_m: float | None = None
+    start: CameraModel, views: Sequence[TargetView], numbers: Sequence[int], k3_held: bool, print_m: float | None = None
 ) -> tuple[Solved, Observations]:
-    """As `solve_lens`, but Brown's k3 is first fitted freely, then held at as much of it as the views tell."""
+    """As `solve_lens`, but Brown's k3, where it is `k3_held`, is first fitted freely, then held at as much of it as the
+    views tell."""
     solved, seen = solve_lens(start, views, numbers, print_m=print_m)
-    if not has_k3(start):
+    if not (k3_held and has_k3(start)):
         return solved, seen
     held = with_weighed_k3(start, solved.scene.models[0], float(solved.std("lens", 0)[-1]))
     return solve_lens(held, views, numbers, print_m=print_m, still=1)

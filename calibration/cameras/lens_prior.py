@@ -2,7 +2,8 @@
 
 Fitted freely (cv2.calibrateCamera does), it follows the noise where views do not reach far out, and a corner that none
 of them showed is off by pixels; left out, a lens that has one is bent wrongly. So it counts by how well the views tell
-it, against how large it is among lenses (an empirical Bayes estimate).
+it, against how large it is among lenses (an empirical Bayes estimate); where they tell it better than that, views kept
+aside decide whether it is held back at all (`lens_fit.py`).
 """
 
 from __future__ import annotations
@@ -26,10 +27,15 @@ def bare(start: CameraModel, kind: DistortionModel) -> CameraModel:
 
 def with_weighed_k3(start: CameraModel, fitted: CameraModel, std: float) -> CameraModel:
     """`start` with the k3 of the lens fitted freely, as far as this standard deviation of it lets one believe it."""
+    k3 = fitted.distortion[-1] * k3_share(fitted, std)
+    return replace(start, distortion=(*start.distortion[:-1], k3))
+
+
+def k3_share(fitted: CameraModel, std: float) -> float:
+    """How much of a k3 fitted freely one believes; above a half, views tell it better than what is known of lenses."""
     r = float(np.hypot(fitted.width / fitted.fx, fitted.height / fitted.fy)) / 2
     among_lenses = AT_CORNER / r**6
-    k3 = fitted.distortion[-1] * among_lenses**2 / (among_lenses**2 + std**2)
-    return replace(start, distortion=(*start.distortion[:-1], k3))
+    return among_lenses**2 / (among_lenses**2 + std**2)
 
 
 def has_k3(model: CameraModel) -> bool:

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from calibration.cameras.bundle import adjust
 from calibration.cameras.extrinsics import calibrate_cameras
 from calibration.cameras.intrinsics import calibrate_intrinsics
-from calibration.cameras.lens_fit import solve_lens
+from calibration.cameras.lens_fit import Fit, solve_lens
 from calibration.cameras.lens_prior import bare, with_weighed_k3
 from calibration.cameras.lens_support import unsupported
 from calibration.cameras.targets import Chessboard, TargetView, find_target
@@ -153,6 +153,20 @@ def test_a_lens_that_bends_by_k3_where_views_reach_is_given_it(geometry):
     lens = calibrate_intrinsics("mono0", (640, 480), views, ("none", "brown-conrady"))
     assert lens.report.details["lens"] == "brown-conrady"
     assert lens.model.distortion[4] == pytest.approx(-0.1, abs=0.03)
+
+
+@pytest.mark.parametrize(
+    ("k3", "distance_m", "sigma_px", "held"), [(-0.35, (0.3, 0.45), 0.5, False), (0.0, (0.8, 1.0), 0.1, True)]
+)
+def test_k3_is_free_where_views_tell_it_and_leave_less_of_those_aside_so(geometry, k3, distance_m, sigma_px, held):
+    """At this image's corner (r = 1) the first is seven times as large as it is among lenses; the second's views do not
+    reach far enough to tell it."""
+    rng = np.random.default_rng(0)
+    true = geometry.camera("mono0", 400.0, distortion_model="brown-conrady", distortion=(-0.3, 0.2, 0.0, 0.0, k3))
+    views = [geometry.view(true, geometry.tilted(rng, distance_m, 0.1), rng, sigma_px) for _ in range(12)]
+    fit = Fit.of(bare(true, "brown-conrady"), views)
+    assert fit.k3_held is held
+    assert abs(fit.model.distortion[4] - k3) < 0.01
 
 
 def lens_told_by(k3):
