@@ -108,8 +108,9 @@ class BoundedQueue(Generic[T]):
         self.fullest = 0
 
     def __len__(self) -> int:
+        """Items, without the marks between them."""
         with self._ready:
-            return len(self._items)
+            return sum(not isinstance(item, threading.Event) for item in self._items)
 
     def offer(self, item: T) -> bool:
         """False where the queue is full: the item was not taken."""

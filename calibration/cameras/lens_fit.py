@@ -52,9 +52,12 @@ class Fit:
         held = Fit.by(start, views, k3_held=True)
         if not has_k3(start):
             return held
+        numbers = [v for v in range(len(views)) if v not in held.rejected]
+        solved, _ = fit_lens(held.model, views, numbers, k3_held=False)
+        if k3_share(solved.scene.models[0], float(solved.std("lens", 0)[-1])) < 0.5:
+            return held
         free = Fit.by(start, views, k3_held=False)
-        told = k3_share(free.model, float(free.solved.std("lens", 0)[-1])) > 0.5
-        return free if told and gain_by_chance(free.aside_px2, held.aside_px2) > 0 else held
+        return free if gain_by_chance(free.aside_px2, held.aside_px2) > 0 else held
 
     @staticmethod
     def by(start: CameraModel, views: Sequence[TargetView], k3_held: bool) -> Fit:
