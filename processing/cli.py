@@ -32,6 +32,8 @@ SAMPLE_FOLDER = Path("samples") / "box_toss"
 SAMPLE_RESULTS = Path("box_toss_results")
 """Of the shipped sample asked for by name: in the folder one works in, never among the program's installed files."""
 CONTACT = "processing.contact_command"
+FOR_REPORT = ("processing.evaluate.report", "matplotlib.backends.backend_agg", "open3d")
+IMPORT_AFTER_S = 30.0
 BASELINE_ROW = "bundlesdf-1"
 _EVALUATING = threading.Lock()
 """Reports are drawn one after the other: what draws them keeps the picture it is at for itself."""
@@ -292,8 +294,17 @@ def _vision(args: argparse.Namespace, engine: Engine, session: Session, name: st
     run = start_run(session, tosses, out, config_of(args), args.tracker, progress, args.device, engine)
     run = _started(args, with_table(run) if args.table_from_depth else run)
     rows: list[tuple[Variant, Scope]] = [(WITH_MODEL, "all")] if model is not None else rows_of(name, args.scope)
+    if not isinstance(engine, InTurn):
+        _import_later()
     each(run, rows, lambda row: process(run, *row, model))
     return run
+
+
+def _import_later() -> None:
+    """What the report needs, which takes seconds, while others compute the stages; nothing waits for it."""
+    timer = threading.Timer(IMPORT_AFTER_S, lambda: [import_module(module) for module in FOR_REPORT])
+    timer.daemon = True
+    timer.start()
 
 
 def _started(args: argparse.Namespace, run: Run) -> Run:

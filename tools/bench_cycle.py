@@ -2,7 +2,7 @@
 
 python tools/bench_cycle.py                         # cube_dev: every row in scope all, then 2 and 5 tosses of `ours`
 python tools/bench_cycle.py --rows ours SESSION... --truth DIR...
-python tools/bench_cycle.py --jobs 1,2 SESSION...   # `ours` with one and with two stages at a time: how much faster
+python tools/bench_cycle.py --jobs 1,2 SESSION...   # `ours` on one core and on two: how much faster
 python tools/bench_cycle.py --read RESULTS...       # what is there already: how much faster it could have been
 
 CPU time, not wall time, except with --jobs, which wants a machine that has nothing else to do. What stages could reach
@@ -47,7 +47,7 @@ def main() -> int:
     parser.add_argument("--truth", nargs="*", type=Path, default=[], help="one for each session")
     parser.add_argument("--rows", default=",".join(v.name for v in (*TABLE, *BEYOND)))
     parser.add_argument("--scope", choices=("one", "all"), default="all")
-    parser.add_argument("--jobs", help="stages at a time to compare, for example 1,2")
+    parser.add_argument("--jobs", help="numbers of cores, and of stages at a time, to compare, for example 1,2")
     parser.add_argument("--read", nargs="+", type=Path, default=[], help="results folders that are there already")
     parser.add_argument("--keep", type=Path, help="keep the results here, and go on from what is there")
     given = parser.parse_args()
@@ -97,11 +97,14 @@ def bench(session: Session, truth: Path, out: Path, rows: Sequence[str], scope: 
 
 
 def side_by_side(session: Session, root: Path, jobs: Sequence[int]) -> None:
-    """`ours` by command, anew with each number of jobs: wall seconds, and how much faster than the first."""
+    """`ours` by command, anew with each number of jobs on as many cores: wall seconds, and how much faster than the
+    first."""
     code, took = "import sys; from processing.cli import main; sys.exit(main())", []
     for n in jobs:
         out, begun = root / f"{session.name}_jobs_{n}", time.monotonic()
         command = [sys.executable, "-c", code, str(session.path), "--jobs", str(n), "--out", str(out)]
+        if hasattr(os, "sched_setaffinity"):  # else one job's readers and OpenCV take a second core
+            command = ["taskset", "-c", ",".join(map(str, sorted(os.sched_getaffinity(0))[:n])), *command]
         subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
         took.append(time.monotonic() - begun)
         print(f"{session.name}: --jobs {n}: {took[-1]:.0f} s, {took[0] / took[-1]:.2f} times as fast as {jobs[0]}")

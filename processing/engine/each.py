@@ -52,8 +52,8 @@ class Engine(Protocol):
     """Two verbs: `each` for those who ask, `run` for the store of stages."""
 
     def each(self, items: Iterable[Item], call: Callable[[Item], Found]) -> dict[Item, Found]:
-        """`call` of every item, in their order. What the first of them raised is raised, once the others that were
-        begun by then have ended; the rest is not begun."""
+        """`call` of every item, begun in their order. What the first of them raised is raised, once the others that
+        were begun by then have ended; the rest is not begun."""
         ...
 
     def run(self, task: Task) -> None:
@@ -96,7 +96,11 @@ class _Asked:
 
 
 class SideBySide:
-    """An engine with slots. Used as a context: what still runs at its end (Ctrl-C) is stopped and cleared away."""
+    """An engine with slots. Used as a context: what still runs at its end (Ctrl-C) is stopped and cleared away.
+
+    The call of an item begins when the one before it has asked for its first stage, or has ended: so stages are asked
+    for in the order of the items, whatever thread is faster, and what most depends on comes first.
+    """
 
     def __init__(self, slots: Sequence[Slot], board: Board) -> None:
         self._slots, self._board = slots, board
@@ -123,17 +127,23 @@ class SideBySide:
 
     def each(self, items: Iterable[Item], call: Callable[[Item], Found]) -> dict[Item, Found]:
         group, wanted = _Group(getattr(self._here, "group", None)), list(items)
+        around: tuple[threading.Event, ...] = getattr(self._here, "asked", ())
+        asked = [threading.Event() for _ in wanted]
         found: dict[Item, Found] = {}
         failed: dict[Item, BaseException] = {}
 
-        def one(item: Item) -> None:
-            self._here.group = group
+        def one(number: int, item: Item) -> None:
+            if number > 0:
+                asked[number - 1].wait()
+            self._here.group, self._here.asked = group, (*around, asked[number])
             try:
                 found[item] = call(item)
             except BaseException as wrong:
                 group.failed, failed[item] = True, wrong
+            finally:
+                asked[number].set()
 
-        threads = [threading.Thread(target=one, args=(item,), daemon=True) for item in wanted]
+        threads = [threading.Thread(target=one, args=each, daemon=True) for each in enumerate(wanted)]
         for thread in threads:
             thread.start()
         for thread in threads:
@@ -150,6 +160,8 @@ class SideBySide:
                 self._board.waiting(len(self._waiting))
                 self._begin()
                 self._changed.notify()
+        for event in getattr(self._here, "asked", ()):
+            event.set()
         asked.done.result()
 
     def _begin(self) -> None:

@@ -13,6 +13,7 @@ import sys
 import threading
 import time
 from functools import partial
+from importlib import import_module
 from multiprocessing.connection import Connection, wait
 from typing import Any
 
@@ -24,6 +25,9 @@ from recordings.progress import Board, Progress, Silent
 PRELOADED = ["processing.pipeline.process"]
 """Imported once, in the process that all workers are forked from (where there is such a one)."""
 REPORT_EVERY_S = 0.2
+WARM_AFTER_S = 2.0
+WARMED = "open3d"
+"""Takes most of a second to import, and many stages ask for it: a worker that waits so long does it meanwhile."""
 
 
 class Worker:
@@ -112,6 +116,8 @@ def work(pipe: Connection, threads: int) -> None:
     allow_threads(threads)
     while True:
         try:
+            if WARMED not in sys.modules and not pipe.poll(WARM_AFTER_S):
+                import_module(WARMED)
             call = pipe.recv_bytes()
         except (EOFError, OSError):
             return

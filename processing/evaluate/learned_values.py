@@ -6,7 +6,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from processing.evaluate.score import Value, rollout_values
 from recordings.results.folder import Results, VariantRecord, read_contact
@@ -53,7 +53,7 @@ def _mean(known: list[tuple[float, float, float]]) -> Value:
     values, n = np.array([x[0] for x in known]), len(known)
     if n == 1:
         return Value(known[0][0], "", 1, "nothing", known[0][1], known[0][2])
-    mean, half = float(values.mean()), float(student.ppf(0.975, n - 1) * values.std(ddof=1) / n**0.5)
+    mean, half = float(values.mean()), float(stdtrit(n - 1, 0.975) * values.std(ddof=1) / n**0.5)
     return Value(mean, "", n, "nothing, mean over tosses", max(mean - half, 0.0), mean + half)
 
 

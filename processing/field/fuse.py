@@ -17,7 +17,7 @@ from numpy import ndarray as Array
 from scipy import ndimage
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
-from processing.engine.parts import in_parts
+from processing.engine.parts import in_parts, side_by_side
 from processing.field.views import FieldView, object_box
 from recordings.tracks import ObjectShape
 
@@ -113,7 +113,9 @@ def fuse(views: Sequence[FieldView], config: FuseConfig, prior_shape: ObjectShap
     grid = Grid(low, voxel_m, config.truncation_m, sdf_m, weight, free, rgb)
     painted = paint[..., 3] > 0
     if prior_shape is None:
-        return replace(complete(grid), rgb=_nearest_color(rgb, painted))
+        fills = (lambda: complete(grid), lambda: replace(grid, rgb=_nearest_color(rgb, painted)))
+        whole, colored = side_by_side(lambda fill: fill(), fills)
+        return replace(whole, rgb=colored.rgb)
     return _completed_by_prior(grid, prior_shape, painted)
 
 

@@ -7,7 +7,7 @@ plane and not along the ray, and the network starts at the fused grid.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 from torch.optim.adam import adam
 
+from processing.engine.parts import side_by_side
 from processing.field.fuse import FuseConfig, Grid, fuse
 from processing.field.network import ObjectField
 from processing.field.poses import PoseConfig, refine_poses
@@ -110,16 +111,28 @@ def _optimise(
     networks = [model.features, *model.geometry.parameters(), *model.appearance.parameters()]
     warm = [model.warm_distance, model.warm_color]
     groups = [Moments(networks, config.learning_rate), Moments(warm, config.warm_learning_rate)]
-    losses = []
+    decay, losses = 0.1 ** (1 / max(config.steps, 1)), []
     for step in range(config.steps):
-        loss = total_loss(model, poses, dataset, config)
-        loss.backward()
-        for group in groups:
-            group.step(decay=0.1 ** (1 / max(config.steps, 1)))
+        loss = _with_gradients(halves_of_loss(model, poses, dataset, config), [*networks, *warm])
+        list(side_by_side(lambda group: group.step(decay), groups))
         if step % 10 == 0:
-            losses.append(float(loss.detach()))
+            losses.append(loss)
         progress.step(config.pose_rounds + step + 1, config.pose_rounds + config.steps, "field: network")
     return tuple(losses)
+
+
+def _with_gradients(halves: Sequence[Callable[[], Tensor]], parameters: Sequence[Tensor]) -> float:
+    """The sum of the halves of a loss, each with its gradients in a thread of its own; their sum is left at the
+    parameters."""
+
+    def of(half: Callable[[], Tensor]) -> tuple[float, Sequence[Tensor | None]]:
+        loss = half()
+        return float(loss.detach()), torch.autograd.grad(loss, parameters, allow_unused=True)
+
+    (one, gradients), (other, more) = side_by_side(of, halves)
+    for parameter, a, b in zip(parameters, gradients, more, strict=True):
+        parameter.grad = b if a is None else a if b is None else a.add_(b)
+    return one + other
 
 
 class Moments:
@@ -168,8 +181,11 @@ class Samples:
     weight: Tensor
 
 
-def total_loss(model: ObjectField, poses: Poses, dataset: RayDataset, config: FieldConfig) -> Tensor:
-    """The weighted sum over one random batch; each term is mean-square or mean-absolute in units of the truncation."""
+def halves_of_loss(
+    model: ObjectField, poses: Poses, dataset: RayDataset, config: FieldConfig
+) -> tuple[Callable[[], Tensor], Callable[[], Tensor]]:
+    """Two parts of about the same work whose sum is the weighted sum over one random batch; each term is mean-square or
+    mean-absolute in units of the truncation. The batch is drawn here, whatever thread computes what."""
     device = dataset.depth.device
     chosen = torch.randint(len(dataset.depth), (config.rays,), device=device)
     passing = torch.randint(max(len(dataset.passing_view), 1), (config.rays // 4,), device=device)
@@ -178,16 +194,24 @@ def total_loss(model: ObjectField, poses: Poses, dataset: RayDataset, config: Fi
     passing_m = passing_points(model, poses, dataset, passing) if len(dataset.passing_view) else near.points_m[:0]
     around_m = eikonal_points(near.points_m[: config.rays // 2].detach())
     surface_m = to_object(poses, dataset.direction[chosen] * dataset.depth[chosen][:, None], dataset.view[chosen])
-    parts = [near.points_m, free.points_m, passing_m, around_m]
-    distances, rgb = model.sdf_and_color(torch.cat(parts), surface_m)
-    at_near, at_free, at_passing, at_around = distances.split([len(p) for p in parts])
-    loss = near_surface_loss(at_near, near, model.truncation_m)
-    loss = loss + config.free_weight * free_space_loss(at_free, free, model.truncation_m)
-    loss = loss + config.color_weight * ((rgb - dataset.rgb[chosen]).abs() * dataset.colored[chosen, None]).mean()
-    if len(passing_m):
+
+    def measured() -> Tensor:
+        parts = [near.points_m, free.points_m]
+        distances, rgb = model.sdf_and_color(torch.cat(parts), surface_m)
+        at_near, at_free = distances.split([len(p) for p in parts])
+        loss = near_surface_loss(at_near, near, model.truncation_m)
+        loss = loss + config.free_weight * free_space_loss(at_free, free, model.truncation_m)
+        return loss + config.color_weight * ((rgb - dataset.rgb[chosen]).abs() * dataset.colored[chosen, None]).mean()
+
+    def regular() -> Tensor:
+        at_passing, at_around = model.sdf(torch.cat([passing_m, around_m])).split([len(passing_m), len(around_m)])
+        loss = config.eikonal_weight * eikonal_loss(at_around)
+        if len(passing_m) == 0:
+            return loss
         inside = inside_only(model, passing_m, at_passing)
-        loss = loss + config.passing_weight * passing_loss(inside, model.truncation_m)
-    return loss + config.eikonal_weight * eikonal_loss(at_around)
+        return loss + config.passing_weight * passing_loss(inside, model.truncation_m)
+
+    return measured, regular
 
 
 def near_surface_samples(model: ObjectField, poses: Poses, dataset: RayDataset, chosen: Tensor, each: int) -> Samples:

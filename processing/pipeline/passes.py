@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from processing.images import Images
 from processing.refine.icp import ShapeSurface
@@ -97,7 +97,7 @@ def certain_share(before: Mapping[int, float], after: Mapping[int, float]) -> fl
     first, gaps = np.array([before[t] for t in both]), np.array([after[t] - before[t] for t in both])
     if len(both) < 2:
         return 0.0
-    beyond = float(student.ppf(1 - CHANCE, len(both) - 1)) * gaps.std(ddof=1) / np.sqrt(len(both))
+    beyond = float(stdtrit(len(both) - 1, 1 - CHANCE)) * gaps.std(ddof=1) / np.sqrt(len(both))
     return float(gaps.mean() / first.mean()) if abs(gaps.mean()) > beyond else 0.0
 
 

@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 from numpy import ndarray as Array
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from processing.sensor.render import RaycastRenderer
 from recordings.geometry import CameraModel
@@ -86,7 +86,7 @@ class Difference:
         """Whether the second explains raw depth worse: by more than SLACK_M, and by more than chance makes it."""
         if self.frames < 2:
             return self.mean_m > SLACK_M
-        beyond = float(student.ppf(1 - CHANCE, max(self.independent - 1, 1.0))) * self.error_m
+        beyond = float(stdtrit(max(self.independent - 1, 1.0), 1 - CHANCE)) * self.error_m
         return self.mean_m > max(SLACK_M, beyond)
 
     def __str__(self) -> str:

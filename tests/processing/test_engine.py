@@ -84,6 +84,21 @@ def test_no_more_are_computed_at_once_than_there_are_slots(three: SideBySide) ->
     assert Here.most == 3
 
 
+def test_stages_are_asked_for_in_the_order_of_the_items_whatever_thread_is_faster() -> None:
+    begun: list[str] = []
+
+    def asks(engine: SideBySide, name: str, after_s: float) -> None:
+        time.sleep(after_s)
+        engine.run(task(name, lambda: begun.append(name)))
+
+    with SideBySide([Here()], Board()) as engine:
+        engine.each(
+            (0, 1, 2), lambda a: engine.each((0, 1), lambda b: asks(engine, f"{a}.{b}", 0.05 * (a == 0) * (2 - b)))
+        )
+    assert [name for name in begun if name.endswith(".0")] == ["0.0", "1.0", "2.0"]
+    assert all(begun.index(f"{a}.0") < begun.index(f"{a}.1") for a in range(3))
+
+
 def test_two_that_ask_for_the_same_stage_get_it_computed_once(three: SideBySide) -> None:
     ran: list[int] = []
 

@@ -22,7 +22,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray as Array
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from processing.contact.friction.forecast import Forecasts, Law, ObservedTrajectory, RigidBody
 from processing.motion.phases import Noise
@@ -147,4 +147,4 @@ def _sampling(tried: Float[Array, " f"], profile: Float[Array, "f n"], rng: np.r
     n = profile.shape[1]
     drawn = rng.multinomial(n, np.full(n, 1 / n), REPEATS)
     spread = float(np.std([lowest(tried, profile @ counts) for counts in drawn], ddof=1))
-    return float(student.ppf(0.975, n - 1)) * spread * (n / (n - 1)) ** 0.5
+    return float(stdtrit(n - 1, 0.975)) * spread * (n / (n - 1)) ** 0.5

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from numpy import ndarray as Array
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from processing.contact.learn.fit import FRICTION, SHAPE, Model, fit
 from processing.contact.physics.loss import StepData, Weights, contact_loss, idle_terms, step_terms
@@ -83,7 +83,7 @@ def bootstrap(
         drawn.append(fit(model, optimum, part, weights, REFIT_SHARE).parameters)
     values = np.array(drawn)
     # n / (n - 1): drawing with replacement narrows the spread of small samples
-    width = float(student.ppf(0.975, max(len(tosses) - 1, 1))) * (len(tosses) / max(len(tosses) - 1, 1)) ** 0.5
+    width = float(stdtrit(max(len(tosses) - 1, 1), 0.975)) * (len(tosses) / max(len(tosses) - 1, 1)) ** 0.5
     points = np.array([model.geometry.points(torch.as_tensor(v[SHAPE])).numpy() for v in values])
     return Spread(
         "bootstrap over tosses",
@@ -115,7 +115,7 @@ def curvature(model: Model, optimum: Float[Array, " p"], data: StepData, weights
     prior = np.array([PRIOR_FRICTION, *(PRIOR_SIZE_M / size)])
     covariance, freedom = _sandwich(H, gradient, data, prior)
     model_error = np.array([MODEL_FRICTION] + [MODEL_SIZE] * 3)
-    curved = float(student.ppf(0.975, freedom)) * np.sqrt(np.diag(covariance))
+    curved = float(stdtrit(freedom, 0.975)) * np.sqrt(np.diag(covariance))
     width = np.sqrt(curved**2 + (1.96 * model_error) ** 2)
     return Spread("curvature of the loss", float(width[0]), width[1:] * size, None)
 

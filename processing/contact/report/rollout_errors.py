@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray as Array
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from processing.contact.learn.learn import ContactLearning
 from processing.contact.learn.prepared import Prepared, prepare, starts
@@ -62,7 +62,7 @@ def summarise(errors: Float[Array, "n t"]) -> Summary:
 def _half_width(values: Float[Array, " n"]) -> float:
     """Half the 95 % interval of a mean (Student's t); 0 for a single value."""
     n = len(values)
-    return float(student.ppf(0.975, n - 1) * values.std(ddof=1) / n**0.5) if n > 1 else 0.0
+    return float(stdtrit(n - 1, 0.975) * values.std(ddof=1) / n**0.5) if n > 1 else 0.0
 
 
 @dataclass(frozen=True, eq=False)

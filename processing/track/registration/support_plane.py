@@ -8,10 +8,10 @@ its calibration (it is solved for, held near zero).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from numpy import ndarray as Array
 
 from processing.motion import se3_kernels as se3
@@ -60,6 +60,8 @@ class SupportPlane:
     stand: Int[Array, " n"]
     planes: Float[Array, "n 4"]
     config: SupportPlaneConfig
+    facing_camera: dict[int, tuple[Float[Array, "p 3"], Float[Array, "p 3"]]] = field(default_factory=dict)
+    """What `_seen` gave, by view: asked for at every step and of every stand."""
 
     def add(
         self, H: Float[Array, "f f 6 6"], g: Float[Array, "f 6"], poses: Float[Array, "n 4 4"], place: Int[Array, " n"]
@@ -83,10 +85,11 @@ class SupportPlane:
         shared = np.zeros((len(g), 6))
         for i in self.views[self.views != stand]:
             back = se3.inverse(poses[i])
-            points, facing = self._facing(int(i), poses[i, :3, :3] @ normal)
+            points, normals = self._seen(int(i))
+            points = points[normals @ (poses[i, :3, :3] @ normal) < -c.facing]
             points = points @ back[:3, :3].T + back[:3, 3]
             above = points @ normal + height
-            on = facing & (np.abs(above) < c.near_m)
+            on = np.abs(above) < c.near_m
             if on.sum() < c.least_points:
                 continue
             points, above = points[on], above[on]
@@ -107,13 +110,16 @@ class SupportPlane:
         touched = np.flatnonzero(np.abs(shared).sum(1) > 0)
         H[np.ix_(touched, touched)] -= np.einsum("ai,bj->abij", shared[touched], shared[touched]) / total
 
-    def _facing(self, view: int, down: Float[Array, "3"]) -> tuple[Float[Array, "p 3"], Bool[Array, " p"]]:
-        """A view's points (camera axes), and which of them face against a direction and the camera."""
-        first, count = int(self.store.table[view, lay.FIRST]), int(self.store.table[view, lay.COUNT])
-        samples = self.store.samples[first : first + count].astype(np.float64)
-        points, normals = samples[:, :3], samples[:, 3:6]
-        towards = -np.einsum("pj,pj->p", points, normals) / np.linalg.norm(points, axis=1)
-        return points, (normals @ down < -self.config.facing) & (towards > self.config.seen)
+    def _seen(self, view: int) -> tuple[Float[Array, "p 3"], Float[Array, "p 3"]]:
+        """A view's points that face its camera, and their normals (camera axes)."""
+        if view not in self.facing_camera:
+            first, count = int(self.store.table[view, lay.FIRST]), int(self.store.table[view, lay.COUNT])
+            samples = self.store.samples[first : first + count].astype(np.float64)
+            points, normals = samples[:, :3], samples[:, 3:6]
+            towards = -np.einsum("pj,pj->p", points, normals) / np.linalg.norm(points, axis=1)
+            seen = towards > self.config.seen
+            self.facing_camera[view] = points[seen], normals[seen]
+        return self.facing_camera[view]
 
 
 def support_plane(
