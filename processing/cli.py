@@ -156,7 +156,7 @@ def _engine(args: argparse.Namespace, first: Path) -> Iterator[Engine]:
     from processing.engine.jobs import chosen_jobs
     from processing.engine.parts import allow_threads
     from processing.engine.slurm import AT_ONCE, slurm_jobs
-    from processing.engine.workers import Worker, begin_imports
+    from processing.engine.workers import AtWork, Worker, begin_imports
 
     jobs, why = (args.jobs or AT_ONCE, None) if args.executor == "slurm" else chosen_jobs(args.jobs)
     if why is not None:
@@ -170,7 +170,8 @@ def _engine(args: argparse.Namespace, first: Path) -> Iterator[Engine]:
     else:
         begin_imports()
         allow_threads(jobs)
-        with SideBySide([Worker(board, jobs) for _ in range(jobs)], board) as engine:
+        at_work = AtWork()
+        with SideBySide([Worker(board, jobs, at_work) for _ in range(jobs)], board) as engine:
             yield engine
 
 

@@ -30,11 +30,25 @@ WARMED = "open3d"
 """Takes most of a second to import, and many stages ask for it: a worker that waits so long does it meanwhile."""
 
 
-class Worker:
-    """A process of our own; `board` shows how far its stage is, `threads` compute its stage's parts (parts.py)."""
+class AtWork:
+    """How many workers compute a stage, written by their parent, read by each of them (`count.value`)."""
 
-    def __init__(self, board: Board, threads: int = 1) -> None:
+    def __init__(self) -> None:
+        self.count = _context().RawValue("i", 0)
+        self._lock = threading.Lock()
+
+    def add(self, change: int) -> None:
+        with self._lock:
+            self.count.value += change
+
+
+class Worker:
+    """A process of our own; `board` shows how far its stage is, `threads` compute its stage's parts (parts.py) for as
+    long as fewer workers than that are `at_work`."""
+
+    def __init__(self, board: Board, threads: int = 1, at_work: AtWork | None = None) -> None:
         self._board, self._threads = board, threads
+        self._at_work = at_work or AtWork()
         self._process: Any = None
         self._pipe: Connection | None = None
         self._stopped = False
@@ -43,6 +57,7 @@ class Worker:
         import cloudpickle
 
         pipe = self._begun()
+        self._at_work.add(1)
         try:
             pipe.send_bytes(cloudpickle.dumps(task.call))
             while True:
@@ -53,6 +68,7 @@ class Worker:
         except (EOFError, OSError):
             raise Lost(self._why(task)) from None
         finally:
+            self._at_work.add(-1)
             self._board.ended(self)
 
     def stop(self) -> None:
@@ -67,7 +83,7 @@ class Worker:
             context = _context()
             self._pipe, theirs = context.Pipe()
             self._process = context.Process(
-                target=work, args=(theirs, self._threads), name="toss-process stages", daemon=True
+                target=work, args=(theirs, self._threads, self._at_work.count), name="toss-process stages", daemon=True
             )
             self._process.start()
             theirs.close()
@@ -106,14 +122,14 @@ _to_parent: Connection | None = None
 """In a worker: where to tell how far its stage is."""
 
 
-def work(pipe: Connection, threads: int) -> None:
+def work(pipe: Connection, threads: int, at_work: Any) -> None:
     """What a worker does: computes what it is sent, until nothing is sent any more."""
     global _to_parent
     _to_parent = pipe
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     _quiet()
-    allow_threads(threads)
+    allow_threads(threads, lambda: at_work.value < threads)
     while True:
         try:
             if WARMED not in sys.modules and not pipe.poll(WARM_AFTER_S):

@@ -386,6 +386,14 @@ def test_what_fails_in_a_part_fails_as_it_would_alone(threads: Callable[[int], N
             in_parts(fails, 3, 1)
 
 
+def test_parts_take_threads_only_while_they_are_wanted(threads: Callable[..., None]) -> None:
+    here, alone = threading.get_ident(), [True]
+    threads(2, lambda: alone[0])
+    assert here not in side_by_side(lambda _: threading.get_ident(), [1, 2, 3])
+    alone[0] = False
+    assert set(side_by_side(lambda _: threading.get_ident(), [1, 2, 3])) == {here}
+
+
 def test_parts_of_a_part_wait_for_no_thread(threads: Callable[[int], None]) -> None:
     """All threads are busy with the outer parts; inner ones that waited for a thread would wait for ever."""
     threads(2)
