@@ -6,7 +6,7 @@ import argparse
 import sys
 import threading
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
@@ -34,6 +34,7 @@ SAMPLE_RESULTS = Path("box_toss_results")
 CONTACT = "processing.contact_command"
 FOR_REPORT = ("processing.evaluate.report", "matplotlib.backends.backend_agg", "open3d")
 IMPORT_AFTER_S = 30.0
+"""Stages that take longer leave time for it; at the start it would be in the way of the first ones."""
 BASELINE_ROW = "bundlesdf-1"
 _EVALUATING = threading.Lock()
 """Reports are drawn one after the other: what draws them keeps the picture it is at for itself."""
@@ -295,17 +296,21 @@ def _vision(args: argparse.Namespace, engine: Engine, session: Session, name: st
     run = start_run(session, tosses, out, config_of(args), args.tracker, progress, args.device, engine)
     run = _started(args, with_table(run) if args.table_from_depth else run)
     rows: list[tuple[Variant, Scope]] = [(WITH_MODEL, "all")] if model is not None else rows_of(name, args.scope)
-    if not isinstance(engine, InTurn):
-        _import_later()
-    each(run, rows, lambda row: process(run, *row, model))
+    with nullcontext() if isinstance(engine, InTurn) else _imports_meanwhile():
+        each(run, rows, lambda row: process(run, *row, model))
     return run
 
 
-def _import_later() -> None:
-    """What the report needs, which takes seconds, while others compute the stages; nothing waits for it."""
+@contextmanager
+def _imports_meanwhile() -> Iterator[None]:
+    """What the report needs takes seconds to import: done while workers compute the stages."""
     timer = threading.Timer(IMPORT_AFTER_S, lambda: [import_module(module) for module in FOR_REPORT])
-    timer.daemon = True
     timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
+        timer.join()
 
 
 def _started(args: argparse.Namespace, run: Run) -> Run:

@@ -99,12 +99,12 @@ def bench(session: Session, truth: Path, out: Path, rows: Sequence[str], scope: 
 def side_by_side(session: Session, root: Path, jobs: Sequence[int]) -> None:
     """`ours` by command, anew with each number of jobs on as many cores: wall seconds, and how much faster than the
     first."""
-    code, took = "import sys; from processing.cli import main; sys.exit(main())", []
+    took = []
     for n in jobs:
+        cores = sorted(os.sched_getaffinity(0))[:n]  # else one job's readers and OpenCV take a second one
+        code = f"import os, sys; os.sched_setaffinity(0, {cores}); from processing.cli import main; sys.exit(main())"
         out, begun = root / f"{session.name}_jobs_{n}", time.monotonic()
         command = [sys.executable, "-c", code, str(session.path), "--jobs", str(n), "--out", str(out)]
-        if hasattr(os, "sched_setaffinity"):  # else one job's readers and OpenCV take a second core
-            command = ["taskset", "-c", ",".join(map(str, sorted(os.sched_getaffinity(0))[:n])), *command]
         subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
         took.append(time.monotonic() - begun)
         print(f"{session.name}: --jobs {n}: {took[-1]:.0f} s, {took[0] / took[-1]:.2f} times as fast as {jobs[0]}")
