@@ -11,7 +11,7 @@ import pytest
 
 from calibration.cameras.extrinsics import calibrate_cameras
 from calibration.cameras.intrinsics import calibrate_intrinsics
-from calibration.cameras.lens_fit import squares_aside
+from calibration.cameras.lens_fit import gain_by_chance, squares_aside
 from calibration.cameras.lens_support import unsupported
 from calibration.cameras.targets import Chessboard, find_target
 from recordings.geometry import CameraModel
@@ -123,11 +123,15 @@ def hand_a():
     ("found", "size"), [(lambda: barry("right"), (640, 512)), (paper, (1280, 720)), (hand_a, (1280, 720))]
 )
 def test_real_views_aside_are_explained_as_well_as_by_plain_opencv(found, size):
-    """Each fifth of the views kept aside once. `barry-right` needs half of its k3, `paper` all of it, `hand-a` none."""
-    views, left = found(), {"ours": [], "plain": []}
+    """Each fifth of the views kept aside once: never worse beyond chance, and by a third of a percent at most.
+    `barry-right` needs half of its k3, `paper` all of it, `hand-a` none."""
+    views, left = found(), {"ours": dict[int, float](), "plain": dict[int, float]()}
     for aside in np.array_split(np.arange(len(views)), 5):
         rest = [v for k, v in enumerate(views) if k not in aside]
         lens = calibrate_intrinsics("color", size, rest, ("none", "brown-conrady")).model
         for way, model in (("ours", lens), ("plain", opencv_lens(rest, size))):
-            left[way] += [q.mean() for q in squares_aside(model, views, aside.tolist()).values()]
-    assert np.mean(left["ours"]) ** 0.5 < 1.005 * np.mean(left["plain"]) ** 0.5
+            squares = squares_aside(model, views, aside.tolist())
+            left[way] |= {v: float(q.mean()) for v, q in squares.items()}
+    ours, plain = (np.mean([*of.values()]) ** 0.5 for of in left.values())
+    assert gain_by_chance(left["ours"], left["plain"]) > -2
+    assert ours < 1.003 * plain
