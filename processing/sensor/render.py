@@ -47,12 +47,16 @@ class RaycastRenderer:
         self._scene.add_triangles(
             o3d.core.Tensor(shape.vertices_m.astype(np.float32)), o3d.core.Tensor(shape.faces.astype(np.uint32))
         )
-        self._vertices_m = shape.vertices_m
+        self._outer_m = _hull_edges(shape.vertices_m)
         self._camera = camera
         self._rays = camera.pixel_rays()
 
     def depth(self, camera_from_object: Float[Array, "4 4"]) -> Float32[Array, "h w"]:
-        return self.hits(camera_from_object)[0]
+        out = np.zeros((self._camera.height, self._camera.width), dtype=np.float32)
+        box = self._box(camera_from_object)
+        if box is not None:
+            out[box] = _met(self._cast(camera_from_object, box))
+        return out
 
     def hits(
         self, camera_from_object: Float[Array, "4 4"]
@@ -64,22 +68,23 @@ class RaycastRenderer:
         box = self._box(camera_from_object)
         if box is None:
             return out, face, weight
-        object_from_camera = np.linalg.inv(camera_from_object)
-        along = self._rays[box] @ object_from_camera[:3, :3].T
-        origin = np.broadcast_to(object_from_camera[:3, 3], along.shape)
-        rays = np.concatenate([origin, along], -1).astype(np.float32)
-        found = self._scene.cast_rays(self._core.Tensor(rays))
-        hit = found["t_hit"].numpy()
-        met = np.isfinite(hit)
-        out[box] = np.where(met, hit, 0)  # rays have z = 1, so t is depth along the axis
-        face[box] = np.where(met, found["primitive_ids"].numpy(), 0)
+        found = self._cast(camera_from_object, box)
+        out[box] = _met(found)
+        face[box] = np.where(out[box] > 0, found["primitive_ids"].numpy(), 0)
         uv = found["primitive_uvs"].numpy()
         weight[box] = np.concatenate([1 - uv.sum(-1, keepdims=True), uv], -1)
         return out, face, weight
 
+    def _cast(self, camera_from_object: Float[Array, "4 4"], box: tuple[slice, slice]) -> Any:
+        object_from_camera = np.linalg.inv(camera_from_object)
+        along = self._rays[box] @ object_from_camera[:3, :3].T
+        rays = np.empty((*along.shape[:2], 6), dtype=np.float32)
+        rays[..., :3], rays[..., 3:] = object_from_camera[:3, 3], along
+        return self._scene.cast_rays(self._core.Tensor(rays))
+
     def _box(self, camera_from_object: Float[Array, "4 4"]) -> tuple[slice, slice] | None:
         """The part of the image that the shape can touch; all of it when a vertex is near or behind the camera."""
-        points = self._vertices_m @ camera_from_object[:3, :3].T + camera_from_object[:3, 3]
+        points = self._outer_m @ camera_from_object[:3, :3].T + camera_from_object[:3, 3]
         whole = (slice(0, self._camera.height), slice(0, self._camera.width))
         if points[:, 2].max() <= 0:
             return None
@@ -91,6 +96,25 @@ class RaycastRenderer:
         rows = slice(max(low[1], 0), min(high[1], self._camera.height))
         columns = slice(max(low[0], 0), min(high[0], self._camera.width))
         return (rows, columns) if rows.start < rows.stop and columns.start < columns.stop else None
+
+
+def _met(found: Any) -> Float32[Array, "h w"]:
+    """How far each ray goes; 0 where it meets nothing. Rays have z = 1, so it is depth along the axis."""
+    hit = found["t_hit"].numpy()
+    return np.where(np.isfinite(hit), hit, np.float32(0.0))
+
+
+def _hull_edges(vertices_m: Float[Array, "v 3"], parts: int = 8) -> Float[Array, "n 3"]:
+    """Points along the edges of the convex hull, the farthest out in any image: a lens bends what lies between."""
+    from scipy.spatial import ConvexHull, QhullError
+
+    try:
+        faces = ConvexHull(vertices_m).simplices
+    except (QhullError, ValueError):  # flat, or too few
+        return vertices_m
+    ends = np.unique(np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), 1), axis=0)
+    share = np.arange(parts + 1)[:, None, None] / parts
+    return ((1 - share) * vertices_m[ends[:, 0]] + share * vertices_m[ends[:, 1]]).reshape(-1, 3)
 
 
 class DrakeRenderer:

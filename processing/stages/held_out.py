@@ -28,7 +28,7 @@ from recordings.whole_file import write_json
 if TYPE_CHECKING:
     from processing.contact.learn.shape_comparison import TossLoss
 
-VERSION = 5
+VERSION = 6
 LEAST_TOSSES = 4
 """From which on there are halves: learned from fewer than two tosses, friction is hardly known."""
 ALONE = "passes are compared by images alone, not by the contact of tosses held out"

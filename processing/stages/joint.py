@@ -23,7 +23,7 @@ from recordings.results.folder import read_shape, read_track, write_shape, write
 from recordings.tracks import ObjectShape, ObjectTrack
 from recordings.whole_file import write_json
 
-VERSION = 4
+VERSION = 5
 BORDER_PX = 2
 FEWEST_PX = 100
 

@@ -16,7 +16,7 @@ from recordings.geometry import rotation_angle_rad
 from recordings.results.folder import read_shape, read_track, write_shape
 from recordings.tracks import ObjectShape, ObjectTrack
 
-VERSION = 2
+VERSION = 3
 
 
 @dataclass(frozen=True)

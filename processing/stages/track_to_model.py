@@ -11,7 +11,7 @@ from processing.stages.track import TrackResult
 from processing.store import Done
 from recordings.results.folder import write_shape, write_track
 
-VERSION = 2
+VERSION = 3
 
 
 def track_to_model(run: Run, images: Images) -> Done[TrackResult]:

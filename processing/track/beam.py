@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Int64
 from numpy import ndarray as Array
 
 from processing.features.sift import FeatureMatcher, Features, RansacConfig, relative_motions
@@ -62,6 +62,11 @@ class BeamConfig:
     motion: MotionConfig = field(default_factory=MotionConfig)
     keyframes: KeyframeConfig = field(default_factory=KeyframeConfig)
     ransac: RansacConfig = field(default_factory=RansacConfig)
+
+
+def seconds(times_ns: Int64[Array, " n"]) -> Float[Array, " n"]:
+    """Times from the first one on."""
+    return np.asarray((times_ns - times_ns[0]) * 1e-9)
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,6 +12,7 @@ import numpy as np
 from numba import njit
 
 from processing.motion.se3_kernels import adjoint, exponential, inverse
+from processing.motion.twist_terms import add_image_residuals, add_residual, add_shading
 from processing.sensor.view_layout import (
     APPEARANCE,
     COUNT,
@@ -55,7 +56,7 @@ ODD_COST = 0.4
 
 
 @no_type_check
-@njit(cache=True, nogil=True, fastmath=True)
+@njit(cache=True, error_model="numpy", nogil=True, fastmath=True)
 def pair_terms(  # noqa: C901
     samples, step, pose, maps, row, focal, center, level, s_geo, s_int, s_out, round_body, shaded, H, g, Hd, gd, B, N
 ):
@@ -108,7 +109,7 @@ def pair_terms(  # noqa: C901
                 dv = 0.5 * (max(maps[near + w, OUTSIDE], 0.0) - max(maps[near - w, OUTSIDE], 0.0))
                 J[0], J[1] = du, dv * fy / fx
                 J[2] = -(du * x + dv * fy / fx * y) * iz
-                _add(J, x, y, z, gap, k, H, g)
+                add_residual(J, x, y, z, gap, k, H, g)
             continue
         mx = pose[0, 0] * p[SNX] + pose[0, 1] * p[SNY] + pose[0, 2] * p[SNZ]
         my = pose[1, 0] * p[SNX] + pose[1, 1] * p[SNY] + pose[1, 2] * p[SNZ]
@@ -153,7 +154,7 @@ def pair_terms(  # noqa: C901
                     trust = min(max((trust - GRAZING) / (FACING - GRAZING), 0.0), 1.0)
                     k *= np.sqrt(trust)
                 J[0], J[1], J[2] = nx, ny, nz
-                _add(J, x, y, z, r_m, wg * k * k, Hd, gd)
+                add_residual(J, x, y, z, r_m, wg * k * k, Hd, gd)
                 cost += 0.5 * min(r * r / 9.0, 1.0)
             elif ahead > 3.0 * s_geo:
                 cost += min(0.5 + ahead / (12.0 * s_geo), 1.0)
@@ -169,6 +170,7 @@ def pair_terms(  # noqa: C901
             if max(foreign, p[SSHARP]) > 0.5 * NO_APPEARANCE:
                 cost += 0.5 * COVERED_COST
                 continue
+            suu = suv = svv = tu = tv = 0.0
             for c in range(APPEARANCE):
                 ch = SHARP + level * APPEARANCE + c
                 i00, i10, i01, i11 = maps[q, ch], maps[q + 1, ch], maps[q + w, ch], maps[q + w + 1, ch]
@@ -181,47 +183,23 @@ def pair_terms(  # noqa: C901
                     gv = bottom - top
                     slope = gu * gu + gv * gv
                     least = LEAST_BRIGHT_SLOPE if c == 0 else LEAST_SLOPE
-                    k = np.sqrt(trust) * (1.0 - r * r / 9.0) * slope / (slope + least * least)
+                    k = (1.0 - r * r / 9.0) * slope / (slope + least * least)
+                    k *= wi * trust * k
                     gu *= fx * iz
                     gv *= fy * iz
-                    J[0], J[1] = gu, gv
-                    J[2] = -(gu * x + gv * y) * iz
-                    _add(J, x, y, z, e, wi * k * k, H, g)
+                    suu, suv, svv = suu + k * gu * gu, suv + k * gu * gv, svv + k * gv * gv
+                    tu, tv = tu + k * gu * e, tv + k * gv * e
                     if shaded:
                         K[0], K[1], K[2] = p[SNX] - mx, p[SNY] - my, p[SNZ] - mz
-                        _add_shading(J, e, wi * k * k, K, 3 * c, B, N)
+                        J[0], J[1], J[2] = gu, gv, -(gu * x + gv * y) * iz
+                        J[3], J[4], J[5] = y * J[2] - z * J[1], z * J[0] - x * J[2], x * J[1] - y * J[0]
+                        add_shading(J, e, k, K, 3 * c, B, N)
+            add_image_residuals(x, y, z, iz, suu, suv, svv, tu, tv, H, g)
     return cost, seen, on, against
 
 
 @no_type_check
-@njit(cache=True, nogil=True, fastmath=True, inline="always")
-def _add(J, x, y, z, r, weight, H, g):
-    """One residual whose derivative by the point is J[:3]."""
-    J[3] = y * J[2] - z * J[1]
-    J[4] = z * J[0] - x * J[2]
-    J[5] = x * J[1] - y * J[0]
-    for a in range(6):
-        ja = weight * J[a]
-        g[a] += ja * r
-        for b in range(a + 1):
-            H[a, b] += ja * J[b]
-
-
-@no_type_check
-@njit(cache=True, nogil=True, fastmath=True, inline="always")
-def _add_shading(J, r, weight, K, first, B, N):
-    """One residual whose derivative by the shading from `first` on is K."""
-    for a in range(3):
-        ka = weight * K[a]
-        N[SHADING, first + a] += ka * r
-        for b in range(3):
-            N[first + a, first + b] += ka * K[b]
-        for b in range(6):
-            B[b, first + a] += ka * J[b]
-
-
-@no_type_check
-@njit(cache=True, nogil=True)
+@njit(cache=True, error_model="numpy", nogil=True)
 def to_object(H, g, pose, sign, H_out, g_out):
     """Adds normal equations of a camera frame to those of the object frame: twist_camera = sign * A twist_object.
 
@@ -238,7 +216,7 @@ def to_object(H, g, pose, sign, H_out, g_out):
 
 
 @no_type_check
-@njit(cache=True, nogil=True)
+@njit(cache=True, error_model="numpy", nogil=True)
 def view_terms(pose, view, refs, ref_poses, maps, samples, table, focal, center, row, H, g):
     """Normal equations of one view's pose against reference views, both ways: its points in their images, theirs in
     its image. Returns mean cost, share of points on the surface, share of violations."""
@@ -272,7 +250,7 @@ def view_terms(pose, view, refs, ref_poses, maps, samples, table, focal, center,
 
 
 @no_type_check
-@njit(cache=True, nogil=True)
+@njit(cache=True, error_model="numpy", nogil=True)
 def align_view(pose, view, refs, ref_poses, maps, samples, table, focal, center, schedule, prior, prior_pose):
     """Gauss-Newton of one view's pose (camera_from_object) against fixed reference views, coarse to fine.
 
@@ -308,7 +286,7 @@ def align_view(pose, view, refs, ref_poses, maps, samples, table, focal, center,
 
 
 @no_type_check
-@njit(cache=True, nogil=True)
+@njit(cache=True, error_model="numpy", nogil=True)
 def _pull(pose, wanted, information, H, g):
     """Adds a pull of `pose` towards `wanted`, to first order in their difference (object frame)."""
     gap = inverse(pose) @ wanted  # object_from_object: where the wanted pose's points lie from here
@@ -329,7 +307,7 @@ def shading_terms(pairs):
 
 
 @no_type_check
-@njit(cache=True, nogil=True)
+@njit(cache=True, error_model="numpy", nogil=True)
 def _add_depth(Hd, gd, turn_share, H, g):
     """Adds depth's normal equations (lower triangle): in full as far as a shift of the points answers them, the rest,
     which is of turns, by `turn_share`.
@@ -352,7 +330,7 @@ def _add_depth(Hd, gd, turn_share, H, g):
 
 
 @no_type_check
-@njit(cache=True, nogil=True)
+@njit(cache=True, error_model="numpy", nogil=True)
 def graph_terms(
     poses, pairs, maps, samples, table, focal, center, row, turn_share, shaded, blocks, gradients, crossed, among,
     figures,

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray as Array
 
-from processing.features.sift import FeatureMatcher, Features
+from processing.features.sift import FeatureMatcher
 from processing.motion import se3_kernels as se3
 from processing.track.track_toss import TossTrack
 from recordings.results.track_notes import Matches, Rejected
@@ -27,17 +27,11 @@ class NotesConfig:
 
 
 def notes_of(
-    tracked: TossTrack,
-    matcher: FeatureMatcher,
-    features: dict[int, Features] | None = None,
-    config: NotesConfig | None = None,
+    tracked: TossTrack, matcher: FeatureMatcher, config: NotesConfig | None = None
 ) -> tuple[Rejected, Matches]:
-    """Rejected poses of every frame and its matches with the keyframe before it (the first one: with the next).
-
-    `features`: what the tracker has described already, by position; the rest is described here.
-    """
-    config, known = config or NotesConfig(), dict(features or {})
-    return rejected_poses(tracked, config), matches_with_keyframes(tracked, matcher, known, config)
+    """Rejected poses of every frame, and the matches of those whose features the tracker looked at."""
+    config = config or NotesConfig()
+    return rejected_poses(tracked, config), matches_with_keyframes(tracked, matcher, config)
 
 
 def rejected_poses(tracked: TossTrack, config: NotesConfig) -> Rejected:
@@ -53,24 +47,17 @@ def rejected_poses(tracked: TossTrack, config: NotesConfig) -> Rejected:
     return Rejected(frame, np.array([c.pose for _, c in kept]), np.array([c.cost for _, c in kept], dtype=np.float64))
 
 
-def matches_with_keyframes(
-    tracked: TossTrack, matcher: FeatureMatcher, known: dict[int, Features], config: NotesConfig
-) -> Matches:
-    """Matches of every tracked frame with one keyframe, and which of them the final poses bring together."""
-    poses, frames, points = tracked.track.camera_from_object, [], []
-
-    def described(i: int) -> Features:
-        if i not in known:
-            known[i] = matcher.describe(tracked.store, i)
-        return known[i]
-
-    for i in np.flatnonzero(np.isfinite(poses[:, 0, 0])):
-        j = _keyframe_for(int(i), tracked.keyframes)
-        if j is None or not np.isfinite(poses[j]).all():
+def matches_with_keyframes(tracked: TossTrack, matcher: FeatureMatcher, config: NotesConfig) -> Matches:
+    """Matches of every tracked frame with the keyframe before it (the first one: with the next), where the features of
+    both are there, and which of them the final poses bring together."""
+    poses, known, frames, points = tracked.track.camera_from_object, tracked.features, [], []
+    for i in np.flatnonzero(np.isfinite(poses[:, 0, 0])).tolist():
+        j = _keyframe_for(i, tracked.keyframes)
+        if j is None or not np.isfinite(poses[j]).all() or i not in known or j not in known:
             continue
-        one, other = described(int(i)), described(j)
+        one, other = known[i], known[j]
         pairs = matcher.match(one, other)[: config.most_matches]
-        frames.append(np.tile([int(i), j], (len(pairs), 1)))
+        frames.append(np.tile([i, j], (len(pairs), 1)))
         points.append(np.stack([one.points_m[pairs[:, 0]], other.points_m[pairs[:, 1]]], 1))
     if not frames:
         return Matches.none()

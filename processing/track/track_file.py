@@ -11,7 +11,7 @@ from numpy import ndarray as Array
 
 from processing.features.sift import Sift
 from processing.motion.motion_prior import gravity_in_camera
-from processing.track.beam import Scene
+from processing.track.beam import Scene, seconds
 from processing.track.depth_color_offset import put_at_color_times
 from processing.track.track_toss import TossTrack, TrackConfig, views_of
 from recordings.geometry import CameraModel, Transform
@@ -49,9 +49,9 @@ def read_toss_track(
     world_from_camera: Transform | None,
 ) -> TossTrack:
     """A toss's track as `track_toss` gave it, its views cut anew from the frames and depth put where the track's motion
-    has it at colour's exposure. The rejected candidates are gone."""
+    has it at colour's exposure. The rejected candidates and features are gone."""
     track = read_track(folder, toss)
-    store, times_s, _ = views_of(frames, masks, camera, confidence, config, world_from_camera, Silent())
+    store, times_ns, _ = views_of(frames, masks, camera, confidence, config, world_from_camera, Silent())
     with stage_arrays(folder / f"toss_{toss:02d}.fit.npz") as stored:
         tracked = TossTrack(
             track=track,
@@ -63,10 +63,11 @@ def read_toss_track(
             center_m=stored["center_m"],
             margin=float(stored["margin"]),
             store=store,
+            features={},
             round_body=bool(stored["round_body"]),
             held=stored["held"],
         )
     gravity = gravity_in_camera(None if world_from_camera is None else world_from_camera.matrix)
-    scene = Scene(store, times_s, gravity, tracked.center_m, Sift())
+    scene = Scene(store, seconds(times_ns), gravity, tracked.center_m, Sift())
     put_at_color_times(scene, track.camera_from_object, ~track.lost)
     return tracked

@@ -9,17 +9,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Int64
 from numpy import ndarray as Array
 
-from processing.features.sift import FeatureMatcher, Sift
+from processing.features.sift import FeatureMatcher, Features, Sift
 from processing.motion.motion_prior import gravity_in_camera
 from processing.sensor import view_layout as lay
 from processing.sensor.photometric_gain import PhotometricGain
 from processing.sensor.rectification import Rectification
 from processing.sensor.view import Crop, ViewConfig, cut
 from processing.sensor.view_store import ViewStore
-from processing.track.beam import BeamConfig, Candidate, Hypothesis, Scene, follow, started
+from processing.track.beam import BeamConfig, Candidate, Hypothesis, Scene, follow, seconds, started
 from processing.track.depth_color_offset import unknown_motion
 from processing.track.flags import (
     FlagConfig,
@@ -76,7 +76,8 @@ class TossTrack:
     `cost` (n): how badly each frame fits the frames that see the same surface, 0 perfect .. 1 (NaN: not tracked);
     `on_surface` (n): share of its points on their surface; `keyframes`: positions of the views that span the object;
     `pairs` (m, 2) compared in the joint refinement; `rejected`: candidates (camera_from_object 4x4) per position;
-    `center_m`: estimated center of mass in the object frame; `store`: the views, for registration between tosses.
+    `center_m`: estimated center of mass in the object frame; `store`: the views, for registration between tosses;
+    `features`: those of the views whose features were looked at on the way, by position.
     """
 
     track: ObjectTrack
@@ -89,6 +90,7 @@ class TossTrack:
     margin: float
     """How much more the best different hypothesis costs (infinite: there is none)."""
     store: ViewStore
+    features: dict[int, Features]
     held: Int[Array, " n"]
     """Frames with the same number are a run through which a robot's hand carries the body; -1: none does."""
     round_body: bool = False
@@ -158,14 +160,14 @@ def track_toss(
     if hand is not None and hand.shape != (len(frames), 4, 4):
         raise BadInput(f"a hand of shape {hand.shape} for {len(frames)} frames; wanted a 4x4 pose per frame, or NaN")
     sure = np.ones(len(frames)) if confidence is None else np.asarray(confidence, dtype=np.float64)
-    store, times_s, drawn = views_of(
+    store, times_ns, drawn = views_of(
         frames, masks, camera, sure, config, world_from_camera, progress, colorless=colorless, model=model
     )
     known = _known(start, start_frame, poses, drawn, len(frames))
     first = _first(store, known, len(frames), toss, config)
-    world = None if world_from_camera is None else world_from_camera.matrix
+    gravity = gravity_in_camera(None if world_from_camera is None else world_from_camera.matrix)
     center_m = _first_center_m(store, first, known) if model is None else center_of(model)
-    scene = Scene(store, times_s, gravity_in_camera(world), center_m, matcher or Sift(), hand=hand)
+    scene = Scene(store, seconds(times_ns), gravity, center_m, matcher or Sift(), hand=hand)
     n = len(frames)
     scene = replace(scene, flying=np.isin(np.arange(n), flying(scene, n, config.flight)))
     if known.poses is None:
@@ -180,8 +182,8 @@ def track_toss(
         lambda share: progress.step(2 * n + int(share * n), 3 * n, "windows"),
     )  # fmt: skip
     joint = select(scene, found, first, keep_first, known.poses is None, config.hypotheses)
-    frame = object_frame if model is None else model.object_frame
-    return _as_track(scene, joint, first, margin, rejected, config, toss, camera.frame, frame, frames)
+    object_frame = object_frame if model is None else model.object_frame
+    return _as_track(scene, joint, first, margin, rejected, config, toss, camera.frame, object_frame, times_ns)
 
 
 def _known(
@@ -220,13 +222,12 @@ def views_of(
     frames: Sequence[RgbdFrame], masks: Sequence[Bool[Array, "h w"]], camera: CameraModel, sure: Float[Array, " n"],
     config: TrackConfig, world_from_camera: Transform | None, progress: Progress,
     colorless: Sequence[Bool[Array, "h w"]] | None = None, model: ObjectShape | None = None,
-) -> tuple[ViewStore, Float[Array, " n"], ShapeViews | None]:  # fmt: skip
-    """All frames as views (depth taken as if exposed with colour), and colour times since the first, seconds; after
-    them in the store the views of a model, where there is one, and their poses."""
+) -> tuple[ViewStore, Int64[Array, " n"], ShapeViews | None]:  # fmt: skip
+    """All frames as views (depth taken as if exposed with colour), and their times; after them in the store the views
+    of a model, where there is one, and their poses."""
     if len(frames) != len(masks) or len(frames) != len(sure):
-        raise BadInput(
-            f"{len(frames)} frames, {len(masks)} masks and {len(sure)} confidences; wanted one each per frame"
-        )
+        found = f"{len(frames)} frames, {len(masks)} masks and {len(sure)} confidences"
+        raise BadInput(f"{found}; wanted one each per frame")
     if len(frames) == 0:
         raise BadInput("a toss without frames; wanted at least one colour and depth frame")
     if colorless is not None and len(colorless) != len(frames):
@@ -248,7 +249,7 @@ def views_of(
     for i in range(len(store)):
         store.fill(i)
     store.take_light_out(len(frames))
-    return store, (np.array(times_ns) - times_ns[0]) * 1e-9, drawn
+    return store, np.array(times_ns, dtype=np.int64), drawn
 
 
 def first_pose(store: ViewStore, view: int) -> Float[Array, "4 4"]:
@@ -368,7 +369,7 @@ def _filled_in(
 def _as_track(
     scene: Scene, hypotheses: list[TrajectoryHypothesis], first: int, margin: float,
     rejected: dict[int, list[Candidate]], config: TrackConfig, toss: int, camera: str, object_frame: str,
-    frames: Sequence[RgbdFrame],
+    times_ns: Int64[Array, " n"],
 ) -> TossTrack:  # fmt: skip
     """The best hypothesis with honest flags."""
     n, best = len(scene.times_s), hypotheses[0]
@@ -392,9 +393,8 @@ def _as_track(
     )
     twists = twists + unjoined_uncertainty(hanging | slipped, best.center_m, config.flags)
     poses, status, covariance = flagged(joint.poses[:n], twists, lost, scene, config.flags)
-    times_ns = np.array([f.time_ns for f in frames], dtype=np.int64)
     track = ObjectTrack(toss, camera, object_frame, times_ns, poses, status, covariance)
     keyframes = tuple(i for i in sorted(best.estimated.keyframes) if i < n and not lost[i])
     pairs = joint.pairs[(joint.pairs < n).all(1)]
     return TossTrack(track, cost, on, keyframes, pairs, rejected, best.center_m, margin, scene.store,
-                     best.held, best.axis is not None)  # fmt: skip
+                     scene.features, best.held, best.axis is not None)  # fmt: skip

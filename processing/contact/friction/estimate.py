@@ -36,8 +36,8 @@ LEAST_FRAMES = 4
 FRICTIONS, RESTITUTIONS = np.geomspace(0.04, 0.63, 7), (0.0, 0.3)
 """Where the search begins: the best pair of these."""
 UNEXPLAINED = 0.15
-SPANS = (0.3, 0.15, 0.08)
-"""Of the searches along log friction (twice), restitution and a third of log unexplained, one after the other."""
+SPANS = (0.3, 0.15, 0.08, 0.04)
+"""Steps to either side along log friction (twice), restitution and a third of log unexplained, one after the other."""
 PROFILE = 0.12 * np.arange(-5, 6)
 """Log frictions about the best, for the interval."""
 REBOUNDS = np.linspace(0.0, 0.9, 13)
@@ -80,8 +80,7 @@ def friction_by_forecasts(
         return None
     forecasts = Forecasts(trajectories, body, noise_of(smoothed))
     law = _search(forecasts)
-    tried = np.exp(np.log(law.friction) + PROFILE)
-    profile = forecasts.scores([replace(law, friction=float(f)) for f in tried])
+    profile = forecasts.scores([replace(law, friction=float(f)) for f in law.friction * np.exp(PROFILE)])
     value = float(np.exp(np.log(law.friction) + lowest(PROFILE, profile.sum(1))))
     sampling = _sampling(PROFILE, profile, np.random.default_rng(seed)) * value
     half_width = float(np.hypot(sampling, 1.96 * MODEL_SHARE * value))
@@ -119,11 +118,11 @@ def _search(forecasts: Forecasts) -> Law:
     """The best of a grid, then friction, restitution and unexplained in turn, over narrower and narrower spans."""
     grid = [Law(float(f), e, UNEXPLAINED) for f in FRICTIONS for e in RESTITUTIONS]
     law = grid[int(forecasts.scores(grid).sum(1).argmin())]
-    sides = np.array([-1.0, -0.5, 0.0, 0.5, 1.0])
+    sides = np.array([-1.0, 0.0, 1.0])
     for span in SPANS:
-        logs = np.log(law.friction) + 2 * span * sides
-        at = forecasts.scores([replace(law, friction=float(np.exp(x))) for x in logs]).sum(1)
-        law = replace(law, friction=float(np.exp(lowest(logs, at))))
+        logs = 2 * span * sides
+        at = forecasts.scores([replace(law, friction=float(law.friction * np.exp(x))) for x in logs]).sum(1)
+        law = replace(law, friction=float(law.friction * np.exp(lowest(logs, at))))
         tried = [replace(law, restitution=float(np.clip(law.restitution + x, 0, 0.9))) for x in span * sides]
         law = tried[int(forecasts.scores(tried).sum(1).argmin())]
         shares = np.clip(law.unexplained * np.exp(3 * span * sides), 0.01, 0.6)

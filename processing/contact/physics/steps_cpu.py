@@ -31,7 +31,7 @@ CONVERGED_M_S, MOST_ROUNDS = 0.002, 5
 """The lift is right when it stays within this; sliding that turns within the step may swing on."""
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
 def _cross(a, b, out):
     out[0] = a[1] * b[2] - a[2] * b[1]
@@ -39,7 +39,7 @@ def _cross(a, b, out):
     out[2] = a[0] * b[1] - a[1] * b[0]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
 def _fly(spin, velocity, inertia, inverse, step_s, work, out):
     """Velocities after a step of free flight: w -= h I^-1 (w x I w), v_z -= h g."""
@@ -56,7 +56,7 @@ def _fly(spin, velocity, inertia, inverse, step_s, work, out):
                 values[i] *= most / size
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
 def _lowest(rotation, height_m, points, contacts, heights, index):
     """The `contacts` lowest points, lowest first: their numbers in `index`; the heights of all in `heights`."""
@@ -75,7 +75,7 @@ def _lowest(rotation, height_m, points, contacts, heights, index):
         count = min(count + 1, contacts)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
 def _problem(
     rotation, spin, velocity, points, heights, index, friction, restitution, root, root_mass, step_s, A, q, swept, speed
@@ -108,7 +108,7 @@ def _problem(
     return count, needed
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
 def _solve(A, q, count, primal, impulse, inner, lift):
     """Impulses by Coulomb's law; whether every problem on the way was solved. `lift` (k,) is room to work in."""
@@ -137,7 +137,7 @@ def _solve(A, q, count, primal, impulse, inner, lift):
     return solved
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
 def _push(A, impulse, count, root, root_mass, spin, velocity, momentum):
     """Adds the impulses to the velocities; returns the change of |v| that they stand for."""
@@ -151,7 +151,7 @@ def _push(A, impulse, count, root, root_mass, spin, velocity, momentum):
     return (momentum[3] ** 2 + momentum[4] ** 2 + momentum[5] ** 2) ** 0.5 / root_mass
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
 def _turn(rotation, spin, step_s, E):
     """R exp(h w), in place."""
@@ -168,7 +168,7 @@ def _turn(rotation, spin, step_s, E):
             rotation[i, j] = r0 * E[0, j] + r1 * E[1, j] + r2 * E[2, j]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
 def roll_rows(rotation, position, spin, velocity, owner, laws, points, inertia, mass, contacts, steps, step_s):
     """Moves n states on by `steps` of `step_s`, in place: rotation (n, 3, 3), position, spin (object axes) and velocity

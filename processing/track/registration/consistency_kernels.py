@@ -13,6 +13,7 @@ import numpy as np
 from numba import njit
 
 from processing.motion import se3_kernels as se3
+from processing.motion.twist_terms import add_image_residuals, add_residual
 from processing.sensor import view_layout as lay
 from processing.track import kernels as k
 
@@ -30,7 +31,7 @@ PULLED = 8.0
 
 
 @no_type_check
-@njit(cache=True, nogil=True, fastmath=True)
+@njit(cache=True, error_model="numpy", nogil=True, fastmath=True)
 def consistency_terms(  # noqa: C901 (one hot loop)
     poses, pairs, maps, points, first, count, table, focal, center, row, rim, blocks, gradients, figures
 ):
@@ -89,7 +90,7 @@ def consistency_terms(  # noqa: C901 (one hot loop)
                     dv = 0.5 * (max(maps[near + w, lay.OUTSIDE], 0.0) - max(maps[near - w, lay.OUTSIDE], 0.0))
                     J[0], J[1] = du, dv * fy / fx
                     J[2] = -(du * x + dv * fy / fx * y) * iz
-                    k._add(J, x, y, z, gap, w_out / (1.0 + r * r / 4.0), H, g)
+                    add_residual(J, x, y, z, gap, w_out / (1.0 + r * r / 4.0), H, g)
                 continue
             zr = maps[near, lay.Z]
             if rim or zr <= 0.0:
@@ -112,7 +113,7 @@ def consistency_terms(  # noqa: C901 (one hot loop)
                 f[DEPTH] += trust * r * r / 9.0
                 kept = 1.0 - r * r / 9.0
                 J[0], J[1], J[2] = nx, ny, nz
-                k._add(J, x, y, z, ahead_m, w_depth * kept * kept * trust, H, g)
+                add_residual(J, x, y, z, ahead_m, w_depth * kept * kept * trust, H, g)
                 ju, jv = int(np.floor(u)), int(np.floor(v))
                 a, b = u - ju, v - jv
                 q = off + jv * w + ju
@@ -121,6 +122,7 @@ def consistency_terms(  # noqa: C901 (one hot loop)
                 if max(foreign, p[lay.SSHARP]) > 0.5 * lay.NO_APPEARANCE:
                     continue
                 f[APPEARANCE_WEIGHT] += trust
+                suu = suv = svv = tu = tv = 0.0
                 for c in range(lay.APPEARANCE):
                     i00, i10, i01, i11 = (
                         maps[q, c0 + c],
@@ -136,14 +138,15 @@ def consistency_terms(  # noqa: C901 (one hot loop)
                         gu, gv = (i10 - i00) * (1 - b) + (i11 - i01) * b, below - above
                         slope = gu * gu + gv * gv
                         kept = trust * (1.0 - r * r / 9.0) * slope / (slope + k.LEAST_SLOPE * k.LEAST_SLOPE)
-                        gu, gv = gu * fx * iz, gv * fy * iz
-                        J[0], J[1], J[2] = gu, gv, -(gu * x + gv * y) * iz
-                        k._add(J, x, y, z, e, w_appearance * kept * kept, H, g)
+                        gu, gv, kept = gu * fx * iz, gv * fy * iz, w_appearance * kept * kept
+                        suu, suv, svv = suu + kept * gu * gu, suv + kept * gu * gv, svv + kept * gv * gv
+                        tu, tv = tu + kept * gu * e, tv + kept * gv * e
+                add_image_residuals(x, y, z, iz, suu, suv, svv, tu, tv, H, g)
             elif ahead_m > 0.0 and zr > z and there > GRAZING:
                 r = ahead_m / s_out
                 f[BEFORE] += min(r * r / 9.0, 1.0)
                 if r < PULLED:
                     J[0], J[1], J[2] = nx, ny, nz
-                    k._add(J, x, y, z, ahead_m, w_out / (1.0 + r * r / 4.0), H, g)
+                    add_residual(J, x, y, z, ahead_m, w_out / (1.0 + r * r / 4.0), H, g)
         blocks[m], gradients[m] = 0.0, 0.0
         k.to_object(H, g, poses[j], 1.0, blocks[m], gradients[m])

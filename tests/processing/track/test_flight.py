@@ -11,7 +11,7 @@ import pytest
 from processing.features.sift import Sift
 from processing.motion.motion_prior import MotionConfig, change_cost, gravity_in_camera
 from processing.motion.rotation_grid import ball
-from processing.track.beam import Scene
+from processing.track.beam import Scene, seconds
 from processing.track.flight import FlightConfig, flights_followed, flying, solved
 from processing.track.flight_kernels import UNKNOWNS, _place
 from processing.track.track_toss import TrackConfig, first_pose, started, views_of
@@ -36,11 +36,11 @@ def scene(tiny_world: Any) -> Scene:
     seen = [tiny_world.see(thrown(i), i) for i in range(HELD + FLIES)]
     frames = [replace(f, time_ns=round(i * STEP_S * 1e9), depth_time_ns=round(i * STEP_S * 1e9))
               for i, (f, _) in enumerate(seen)]  # fmt: skip
-    store, times_s, _ = views_of(
+    store, times_ns, _ = views_of(
         frames, [m for _, m in seen], tiny_world.camera, np.ones(len(frames)), TrackConfig(),
         tiny_world.world_from_camera, Silent(),
     )  # fmt: skip
-    return Scene(store, times_s, gravity_in_camera(tiny_world.world_from_camera.matrix), np.zeros(3), Sift())
+    return Scene(store, seconds(times_ns), gravity_in_camera(tiny_world.world_from_camera.matrix), np.zeros(3), Sift())
 
 
 def test_no_place_in_a_ball_is_far_from_its_lattice() -> None:

@@ -11,7 +11,7 @@ import pytest
 from processing.features.sift import Sift
 from processing.motion.interpolate import carried_on
 from processing.track.appearance_ratio import AppearanceRatioConfig, log_likelihood_ratio
-from processing.track.beam import Scene
+from processing.track.beam import Scene, seconds
 from processing.track.joint_refinement import GraphConfig, choose_pairs
 from processing.track.track_toss import TrackConfig, views_of
 from recordings.geometry import rotation_exp
@@ -91,10 +91,10 @@ def seen_turning(world: Any, faces_rgb: np.ndarray) -> tuple[Scene, np.ndarray]:
         frames.append(frame)
         masks.append(mask)
         poses.append((camera_from_world @ pose).matrix)
-    store, times_s, _ = views_of(
+    store, times_ns, _ = views_of(
         frames, masks, world.camera, np.ones(7), TrackConfig(), world.world_from_camera, Silent()
     )
-    return Scene(store, times_s, np.zeros(3), np.zeros(3), Sift()), np.stack(poses)
+    return Scene(store, seconds(times_ns), np.zeros(3), np.zeros(3), Sift()), np.stack(poses)
 
 
 @pytest.mark.parametrize("label", [True, False])

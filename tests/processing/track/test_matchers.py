@@ -200,7 +200,7 @@ def tracked(store: ViewStore, second: np.ndarray) -> TossTrack:
     tried = [Candidate(POSES[0], fit, 0.0, 1.0, "prior") for fit in (0.5, 0.3, 0.4)]
     figures = np.array([0.1, 0.1, np.nan])
     return TossTrack(track, figures, figures, (0,), np.array([[0, 1]]), {1: tried}, np.zeros(3), 1.0, store,
-                     np.full(len(figures), -1))  # fmt: skip
+                     {i: Sift().describe(store, i) for i in range(2)}, np.full(len(figures), -1))  # fmt: skip
 
 
 def test_notes_keep_the_cheapest_rejected_poses_and_matches_that_the_poses_judge(store: ViewStore) -> None:

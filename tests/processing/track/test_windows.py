@@ -13,7 +13,7 @@ from processing.config import Config
 from processing.features.sift import Sift
 from processing.live.config import light
 from processing.motion.motion_prior import gravity_in_camera
-from processing.track.beam import Scene
+from processing.track.beam import Scene, seconds
 from processing.track.hypotheses import TrajectoryHypothesis, refined
 from processing.track.track_toss import TrackConfig, first_pose, started, views_of
 from processing.track.windows import WindowConfig, _distinct, _poses, through_windows
@@ -41,12 +41,12 @@ def scene(tiny_world: Any) -> Scene:
     seen = [tiny_world.see(thrown(i), i) for i in range(FRAMES)]
     frames = [replace(f, time_ns=round(i * STEP_S * 1e9), depth_time_ns=round(i * STEP_S * 1e9))
               for i, (f, _) in enumerate(seen)]  # fmt: skip
-    store, times_s, _ = views_of(
+    store, times_ns, _ = views_of(
         frames, [m for _, m in seen], tiny_world.camera, np.ones(FRAMES), TrackConfig(), tiny_world.world_from_camera,
         Silent(),
     )  # fmt: skip
     gravity = gravity_in_camera(tiny_world.world_from_camera.matrix)
-    return Scene(store, times_s, gravity, np.array([0.0, 0.0, 0.03]), Sift())
+    return Scene(store, seconds(times_ns), gravity, np.array([0.0, 0.0, 0.03]), Sift())
 
 
 def sliding(scene: Scene, spin: Array) -> TrajectoryHypothesis:
