@@ -13,7 +13,6 @@ the drops of bench_record's recorder (848x480 colour and depth, three grey camer
 from __future__ import annotations
 
 import argparse
-import os
 import re
 import subprocess
 import sys
@@ -23,11 +22,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
-import numpy as np
-
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
+
+import processing  # noqa: E402, F401, I001 (before numpy: as in toss-process, its BLAS works in one thread)
+import cv2  # noqa: E402
+import numpy as np  # noqa: E402
 
 from processing.config import Config  # noqa: E402
 from processing.live import bounds  # noqa: E402
@@ -186,7 +186,6 @@ def main() -> int:
     parser.add_argument("--tosses", type=int)
     parser.add_argument("--learn", type=int, default=3)
     args = parser.parse_args()
-    os.environ.setdefault("OMP_NUM_THREADS", "1")
     run = {
         "toss": lambda: bench_toss(args.session, args.tosses or 10),
         "rates": lambda: bench_rates(args.session, args.tosses or 10),

@@ -129,5 +129,5 @@ def thinned(tracked: TossTrack, most: int) -> TossTrack:
     none = np.zeros((0, 2), dtype=tracked.pairs.dtype)
     return replace(
         tracked, track=few, cost=tracked.cost[at], on_surface=tracked.on_surface[at], store=tracked.store.only(at),
-        held=tracked.held[at], keyframes=tuple(range(len(at))), pairs=none, rejected={},
+        held=tracked.held[at], keyframes=tuple(range(len(at))), pairs=none, rejected={}, features={},
     )  # fmt: skip

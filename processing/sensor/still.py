@@ -71,10 +71,19 @@ class _Blocks:
 
 def still_stretches(frames: Sequence[RgbdFrame], settings: StillSettings, progress: Progress) -> list[tuple[int, int]]:
     """First and last position of every run of `settings.least` frames or more in which nothing moves."""
-    blocks = []
-    for i, frame in enumerate(frames):
-        blocks.append(_blocks(frame, settings))
-        progress.step(i + 1, len(frames))
+    known: dict[int, _Blocks] = {}
+
+    def looked(i: int) -> _Blocks:
+        if i not in known:
+            known[i] = _blocks(frames[i], settings)
+            progress.step(len(known), len(frames))
+        return known[i]
+
+    apart, most = settings.least - 1, (settings.color_noise[1], settings.depth_noise[1])
+    ends = ((looked(i), looked(i + apart)) for i in range(len(frames) - apart))
+    if all(_moved(one, other, most, settings) for one, other in ends):  # by more than any noise: no run is so long
+        return []
+    blocks = [looked(i) for i in range(len(frames))]
     noise = _noise(blocks, settings)
     found, first = [], 0
     for i in range(1, len(blocks) + 1):

@@ -236,7 +236,7 @@ def _tracking_words(body: Body) -> list[str]:
     if any(len(n.matches.frames) for n in body.notes.values()):
         lines += [
             "- **Lines in the colour image** (hidden: click their eye in the list of entities): feature matches with a "
-            "keyframe; red ones do not fit the poses."
+            "keyframe, where the tracker looked at any; red ones do not fit the poses."
         ]
     if any(len(n.rejected.frame) for n in body.notes.values()):
         lines += ["- **Grey axes**: poses that were tried and not taken, with what they cost."]

@@ -193,8 +193,15 @@ def place_among(
     last = len(others)
     fit = np.where(np.arange(len(tosses)) == last, np.nan, 0.0)
     moves = np.tile(np.eye(4), (len(tosses), 1, 1))
-    placing = _Placing(keyframes, Rims.of(keyframes.store), matcher or Sift(), config, moves, fit)
+    of_others = [
+        (i, tosses[n].features, int(f)) for i, (n, f) in enumerate(zip(keyframes.toss, keyframes.frame)) if n < last
+    ]
+    known = {i: features[frame] for i, features, frame in of_others if frame in features}
+    placing = _Placing(keyframes, Rims.of(keyframes.store), matcher or Sift(), config, moves, fit, known)
     gap = float(_placed(placing, [last], lambda t: _many_views(tosses, None, t, config), Silent())[last])
+    for i, features, frame in of_others:  # for the tosses after this one
+        if i in placing.features:
+            features[frame] = placing.features[i]
     joined = bool(np.isfinite(fit[last]))
     return Placement(moves[last], float(fit[last]), gap, joined, joined and gap < config.ambiguous)
 
