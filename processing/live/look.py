@@ -66,10 +66,11 @@ class Looker:
             live = self.live
             run = thrown_frames(run, toss, live.before_release_s, live.after_rest_s, live.least_thrown)
             run, images = masked(run, toss, self.shared, step)
+            images = replace(images, masks=list(images.masks))  # each decoded once
             step("track")
             tracked = _track(run, toss, images)
             step("what is seen")
-            seen = what_is_seen(images.frames, list(images.masks), self.live)
+            seen = what_is_seen(images.frames, images.masks, self.live)
             window = run.session.toss(toss).window()
             return Looked(toss, file, tracked, seen, self._views(run, tracked, images), window)
         finally:

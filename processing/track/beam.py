@@ -114,7 +114,8 @@ class Hypothesis:
 
     @property
     def tracked(self) -> tuple[int, ...]:
-        return tuple(i for i in self.done if np.isfinite(self.poses[i, 0, 0]))
+        done = np.array(self.done, dtype=np.int64)
+        return tuple(done[np.isfinite(self.poses[done, 0, 0])].tolist())
 
 
 @dataclass(frozen=True, eq=False)

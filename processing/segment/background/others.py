@@ -19,7 +19,7 @@ from processing.segment.background.foreground import (
     window_around,
 )
 from processing.segment.background.placement import best_shift, shifted
-from processing.segment.background.static_scene import StaticScene
+from processing.segment.background.static_scene import StaticScene, most_of_channels
 from recordings.records import RgbdFrame
 
 PLACE_PX = 5.0
@@ -120,7 +120,7 @@ def largest_other(
         left, top, width, height = stats[k, :4]
         at = np.s_[top : top + height, left : left + width]
         thing = labels[at] == k
-        apart = np.abs(frame.color_rgb[at][thing] - scene.color_rgb[at][thing]).max(-1)
+        apart = most_of_channels(np.abs(frame.color_rgb[at] - scene.color_rgb[at]))[thing]
         if (apart > np.maximum(s.color_step, 4 * scene.color_sigma[at][thing])).mean() > 0.5:
             return int(stats[k, cv2.CC_STAT_AREA])
     return 0

@@ -241,7 +241,7 @@ def _color_median(colors: Array, empty: Bool[Array, "n h w"]) -> tuple[Float32[A
     """Median colour over the frames in which a pixel shows the scene (over all, where it never does), and its noise."""
     use = empty | ~empty.any(0, keepdims=True)
     color = np.stack([_masked_median(colors[..., k].astype(np.float32), use) for k in range(3)], -1)
-    spread = np.abs(colors.astype(np.float32) - color).max(-1)
+    spread = most_of_channels(np.abs(colors.astype(np.float32) - color))
     return color, (MAD_TO_SIGMA_SHORT * _masked_median(spread, use)).astype(np.float32)
 
 
@@ -333,19 +333,19 @@ def exposure_gain(frame: RgbdFrame, scene: StaticScene) -> tuple[float, float]:
     """How bright the frame is against the scene (median over known pixels that are not clipped), and the share of the
     scene's mid-bright pixels that are clipped in the frame."""
     color, base = np.ascontiguousarray(frame.color_rgb[::4, ::4]), np.ascontiguousarray(scene.color_rgb[::4, ::4])
-    brightest = _brightest(base)
+    brightest = most_of_channels(base)
     level = scene.known[::4, ::4] & (brightest > 20) & (brightest < 230)
     if not level.any():
         return 1.0, 0.0
-    clipped = _brightest(color)[level] >= 250
+    clipped = most_of_channels(color)[level] >= 250
     usable = ~clipped if not clipped.all() else clipped
     seen, usual = color[level][usable].astype(np.float32), base[level][usable]
     ratio = seen @ np.ones(3, np.float32) / np.maximum(usual @ np.ones(3, np.float32), 1.0)
     return float(np.median(ratio)), float(clipped.mean())
 
 
-def _brightest(color: Array) -> Array:
-    """Of the three channels; much faster than .max(-1)."""
+def most_of_channels(color: Array) -> Array:
+    """The most of the three channels; much faster than .max(-1)."""
     return np.asarray(np.maximum(np.maximum(color[..., 0], color[..., 1]), color[..., 2]))
 
 
