@@ -20,9 +20,10 @@ $(BASE): pyproject.toml constraints.txt
 	$(BIN)/python tools/check_system.py --for demo --bring .venv
 	@echo "installing packages, gigabytes of them: pip says nothing meanwhile, for minutes"
 	# torch first and pinned: otherwise another package pulls the newest CUDA build, several gigabytes
-	$(BIN)/python -m pip install -q torch==2.13.0 -c constraints.txt
-	$(BIN)/python -m pip install -q -e . -c constraints.txt
-	$(BIN)/python tools/compile_kernels.py
+	$(BIN)/python -m pip install -q --no-compile torch==2.13.0 -c constraints.txt
+	$(BIN)/python -m pip install -q --no-compile -e . -c constraints.txt
+	# what pip would compile on one core, beside the kernels (some files are of newer Pythons: as pip, it passes them by)
+	$(BIN)/python -m compileall -qq .venv/lib & $(BIN)/python tools/compile_kernels.py; kernels=$$?; wait; exit $$kernels
 	touch $@
 
 $(STAMP): $(BASE)
