@@ -22,8 +22,8 @@ $(BASE): pyproject.toml constraints.txt
 	# torch first and pinned: otherwise another package pulls the newest CUDA build, several gigabytes
 	$(BIN)/python -m pip install -q --no-compile torch==2.13.0 -c constraints.txt
 	$(BIN)/python -m pip install -q --no-compile -e . -c constraints.txt
-	# what pip would compile on one core, beside the kernels (some files are of newer Pythons: as pip, it passes them by)
-	$(BIN)/python -m compileall -qq .venv/lib & $(BIN)/python tools/compile_kernels.py; kernels=$$?; wait; exit $$kernels
+	# what pip would compile on one core, beside the kernels (files of newer Pythons are passed by, as pip does)
+	$(BIN)/python -m compileall -qq .venv/lib acquisition calibration groundtruth processing recordings & $(BIN)/python tools/compile_kernels.py; kernels=$$?; wait; exit $$kernels
 	touch $@
 
 $(STAMP): $(BASE)
