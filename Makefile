@@ -23,7 +23,8 @@ $(BASE): pyproject.toml constraints.txt
 	$(BIN)/python -m pip install -q --no-compile torch==2.13.0 -c constraints.txt
 	$(BIN)/python -m pip install -q --no-compile -e . -c constraints.txt
 	# what pip would compile on one core, beside the kernels (files of newer Pythons are passed by, as pip does)
-	$(BIN)/python -m compileall -qq .venv/lib acquisition calibration groundtruth processing recordings & $(BIN)/python tools/compile_kernels.py; kernels=$$?; wait; exit $$kernels
+	$(BIN)/python -m compileall -qq .venv/lib acquisition calibration groundtruth processing recordings & \
+	$(BIN)/python tools/compile_kernels.py; kernels=$$?; wait; exit $$kernels
 	touch $@
 
 $(STAMP): $(BASE)
