@@ -15,10 +15,9 @@ from numba import njit
 @no_type_check
 @njit(cache=True, error_model="numpy", nogil=True, fastmath=True, inline="always")
 def add_residual(J, x, y, z, r, weight, H, g):
-    """One residual whose derivative by the point is J[:3]; J[3:] becomes that by its turn."""
+    """One residual whose derivative by the point is J[:3]."""
     a0, a1, a2 = J[0], J[1], J[2]
     a3, a4, a5 = y * a2 - z * a1, z * a0 - x * a2, x * a1 - y * a0
-    J[3], J[4], J[5] = a3, a4, a5
     w0, w1, w2, w3, w4, w5 = weight * a0, weight * a1, weight * a2, weight * a3, weight * a4, weight * a5
     g[0], g[1], g[2] = g[0] + w0 * r, g[1] + w1 * r, g[2] + w2 * r
     g[3], g[4], g[5] = g[3] + w3 * r, g[4] + w4 * r, g[5] + w5 * r

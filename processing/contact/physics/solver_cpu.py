@@ -15,18 +15,16 @@ from numba import njit
 
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
-def _project(y, size, out):
-    """Nearest points of the Lorentz cones {y_2 >= |y_01|}."""
-    for c in range(size // 3):
-        tx, ty, n = y[3 * c], y[3 * c + 1], y[3 * c + 2]
-        length = (tx * tx + ty * ty) ** 0.5
-        if length <= n:
-            out[3 * c], out[3 * c + 1], out[3 * c + 2] = tx, ty, n
-        elif length <= -n:
-            out[3 * c] = out[3 * c + 1] = out[3 * c + 2] = 0.0
-        else:
-            half = 0.5 * (n + length)
-            out[3 * c], out[3 * c + 1], out[3 * c + 2] = tx * half / length, ty * half / length, half
+def _projected(tx, ty, n):
+    """The nearest point of the Lorentz cone {n >= |t|}."""
+    length = (tx * tx + ty * ty) ** 0.5
+    if length <= n:
+        return tx, ty, n
+    if length <= -n:
+        return 0.0, 0.0, 0.0
+    half = 0.5 * (n + length)
+    share = half / length
+    return share * tx, share * ty, half
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -110,14 +108,7 @@ def _slope_at(y, Ad, size, length, v, d, epsilon, near, impulse):
     for c in range(0, size, 3):
         tx, ty, n = y[c] - step * Ad[c], y[c + 1] - step * Ad[c + 1], y[c + 2] - step * Ad[c + 2]
         near[c], near[c + 1], near[c + 2] = tx, ty, n
-        size_of_t = (tx * tx + ty * ty) ** 0.5
-        if size_of_t > n:
-            if size_of_t <= -n:
-                tx = ty = n = 0.0
-            else:
-                half = 0.5 * (n + size_of_t)
-                share = half / size_of_t
-                tx, ty, n = share * tx, share * ty, half
+        tx, ty, n = _projected(tx, ty, n)
         impulse[c], impulse[c + 1], impulse[c + 2] = tx, ty, n
         here -= Ad[c] * tx + Ad[c + 1] * ty + Ad[c + 2] * n
     return here
@@ -183,7 +174,8 @@ def solve_row(A, q, size, epsilon, v, tolerance, most_iterations, flat_enough, s
     (y, near, Ad), (gradient, d, momentum), H = work
     iterations = 0
     _outward(A, v, q, size, epsilon, y)
-    _project(y, size, impulse)
+    for c in range(0, size, 3):
+        impulse[c], impulse[c + 1], impulse[c + 2] = _projected(y[c], y[c + 1], y[c + 2])
     while iterations < most_iterations:
         iterations += 1
         size_of_v = size_of_momentum = size_of_gradient = value = 0.0
