@@ -26,9 +26,10 @@ def extract_mesh(field: ObjectField, grid: Grid, object_frame: str = "object", s
 
 
 def grid_mesh(grid: Grid, object_frame: str = "object", source: str = "fused") -> ObjectShape:
-    """The fused grid's surface, without the network."""
+    """The fused grid's surface and colours, without the network."""
     vertices_m, faces = surface_of(grid.sdf_m, grid)
-    return ObjectShape(object_frame, source, vertices_m, faces, None, _observed(grid, vertices_m))
+    rgb = (grid.rgb[_cells_of(grid, vertices_m)].clip(0, 1) * 255).round().astype(np.uint8)
+    return ObjectShape(object_frame, source, vertices_m, faces, rgb, _observed(grid, vertices_m))
 
 
 def surface_of(sdf_m: Float32[Array, "a b c"], grid: Grid) -> tuple[Float[Array, "v 3"], Array]:
@@ -83,7 +84,12 @@ def _colors(field: ObjectField, vertices_m: Float[Array, "v 3"]) -> Array:
 
 def _observed(grid: Grid, vertices_m: Float[Array, "v 3"]) -> Bool[Array, " v"]:
     """Whether a vertex lies where views measured a surface."""
-    cells = np.rint((vertices_m - grid.origin_m) / grid.voxel_m).astype(int).T
-    inside = np.clip(cells, 0, np.array(grid.sdf_m.shape)[:, None] - 1)
     seen = ndimage.maximum_filter((grid.weight > 0).astype(np.uint8), size=3)
-    return seen[tuple(inside)] > 0
+    return seen[_cells_of(grid, vertices_m)] > 0
+
+
+def _cells_of(grid: Grid, vertices_m: Float[Array, "v 3"]) -> tuple[Array, Array, Array]:
+    """The grid's cell nearest to each vertex, as an index."""
+    cells = np.rint((vertices_m - grid.origin_m) / grid.voxel_m).astype(int).T
+    i, j, k = np.clip(cells, 0, np.array(grid.sdf_m.shape)[:, None] - 1)
+    return i, j, k

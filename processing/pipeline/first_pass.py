@@ -12,6 +12,7 @@ import numpy as np
 
 from processing.images import Images
 from processing.pipeline import notices as say
+from processing.pipeline.cross_fit import cross_fitted, located_on
 from processing.pipeline.passes import Pass
 from processing.run import Run, each
 from processing.stages.field import learn_field
@@ -28,17 +29,36 @@ def first_pass(run: Run, alone: Mapping[int, Done], images: Mapping[int, Images]
     apart, and the others joined anew: they were refined together with the wrong ones."""
     refuse_baseline(run.tracker)
     tosses, warnings = run.tosses, list(say.of_tracks(alone))
+    apart: tuple[int, ...] = ()
     while True:
         placed = register(run, {t: alone[t] for t in tosses}, images)
         joined = [t for t in tosses if t not in placed.result.not_joined]
-        shape = learn_field(run, "all tosses", dict.fromkeys(joined, placed), images)
-        apart = kept_apart(run, placed, shape, images, joined)
-        if not apart:
-            warnings += say.of_register(placed)
-            return Pass(dict.fromkeys(tosses, placed), dict.fromkeys(tosses, shape),
-                        shared_frame=tosses == run.tosses, warnings=tuple(warnings))  # fmt: skip
-        warnings.append(say.kept_apart(apart))
-        tosses = tuple(t for t in tosses if t not in apart)
+        fused = fuse_frames(run, dict.fromkeys(joined, placed), images)
+        alien = kept_apart(run, placed, fused, images, joined)
+        if not alien:
+            break
+        apart, tosses = (*apart, *alien), tuple(t for t in tosses if t not in alien)
+    fitted = cross_fitted(run, images, dict.fromkeys(joined, placed), alone)
+    found = located(run, images, fitted, [t for t in run.tosses if t not in joined])
+    apart = tuple(sorted(t for t in apart if t not in found))
+    warnings += [say.kept_apart(apart)] if apart else []
+    warnings += say.of_register(placed, found)
+    tracks = {**dict.fromkeys(tosses, placed), **fitted, **found}
+    tracks = {t: tracks[t] for t in run.tosses if t not in apart}
+    shape = learn_field(run, "all tosses", {**fitted, **found}, images)
+    return Pass(tracks, dict.fromkeys(tracks, shape), shared_frame=not apart, warnings=tuple(warnings))
+
+
+def located(
+    run: Run, images: Mapping[int, Images], joined: Mapping[int, Done], missing: Sequence[int]
+) -> dict[int, Done]:
+    """Of tosses that registration could not join, those whose object is found on the shape of the others, by tracking
+    it there from the start, and is explained by it."""
+    if not missing:
+        return {}
+    shape = fuse_frames(run, joined, images)
+    tracks = {t: done for t, done in each(run, missing, lambda t: located_on(run, images[t], shape)).items() if done}
+    return {t: done for t, done in tracks.items() if not _unexplained(run, done, shape, images, [t])}
 
 
 def start_alone(run: Run, toss: int, first: Pass, alone: Done, images: Mapping[int, Images]) -> Pass:
@@ -65,7 +85,7 @@ def kept_apart(
     kept: list[int] = list(joined[:1])
     for toss in joined[1:]:
         tried = [*kept, toss]
-        if not _unexplained(run, together, fuse_frames(run, together, images, tried), images, tried):
+        if not _unexplained(run, together, fuse_frames(run, dict.fromkeys(tried, together), images), images, tried):
             kept = tried
     return tuple(t for t in joined if t not in kept)
 
@@ -79,7 +99,7 @@ def _unexplained(
     unexplained = [t for t in tosses if left[t] > limit]
     if not unexplained:
         return []
-    alone = _left(run, together, each(run, unexplained, lambda t: fuse_frames(run, together, images, [t])), images)
+    alone = _left(run, together, each(run, unexplained, lambda t: fuse_frames(run, {t: together}, images)), images)
     return [t for t in unexplained if left[t] > alone[t] + 0.5 * limit]
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 from processing.config import CycleConfig
@@ -118,9 +118,11 @@ def of_contact(done: Done) -> list[Notice]:
     return [Notice.from_json(n) for n in stored]
 
 
-def of_register(done: Done[RegisterResult]) -> list[Notice]:
-    """Tosses that are not in the object frame of the others, or not surely."""
-    found, left_out, unsure = [], list(done.result.not_joined), list(done.result.ambiguous)
+def of_register(done: Done[RegisterResult], located: Collection[int] = ()) -> list[Notice]:
+    """Tosses that are not in the object frame of the others, or not surely; `located`: those that were found on the
+    others' shape all the same."""
+    left_out = [t for t in done.result.not_joined if t not in located]
+    found, unsure = [], list(done.result.ambiguous)
     if left_out:
         seen = f"tosses {left_out} could not be brought into the object frame of the others: lost"
         do = f"most often they show other sides than the rest, or too little detail; seldom it is another object: {SEE}"

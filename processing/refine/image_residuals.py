@@ -6,7 +6,7 @@ depth inside the first masks, the outline of those masks, and the picture's own 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 
 import numpy as np
@@ -73,33 +73,42 @@ class Explained:
 
 @dataclass(frozen=True)
 class Difference:
-    """Mean of the differences of depth residuals in the same frames (m; positive: the second is worse), its standard
-    error, the frames, and how many independent ones they are worth."""
+    """Mean of the differences of residuals in the same frames (of depth: m; positive: the second is worse), its
+    standard error, the frames, and how many independent ones they are worth."""
 
-    mean_m: float
-    error_m: float
+    mean: float
+    error: float
     frames: int
     independent: float
 
     @property
+    def by_chance(self) -> float:
+        """What chance alone makes of it at most (one side of a t-test)."""
+        return float(stdtrit(max(self.independent - 1, 1.0), 1 - CHANCE)) * self.error if self.frames > 1 else 0.0
+
+    @property
     def worse(self) -> bool:
         """Whether the second explains raw depth worse: by more than SLACK_M, and by more than chance makes it."""
-        if self.frames < 2:
-            return self.mean_m > SLACK_M
-        beyond = float(stdtrit(max(self.independent - 1, 1.0), 1 - CHANCE)) * self.error_m
-        return self.mean_m > max(SLACK_M, beyond)
+        return self.mean > max(SLACK_M, self.by_chance)
 
     def __str__(self) -> str:
-        return f"{1e3 * self.mean_m:+.3f} mm, standard error {1e3 * self.error_m:.3f} mm, {self.frames} frames"
+        return f"{1e3 * self.mean:+.3f} mm, standard error {1e3 * self.error:.3f} mm, {self.frames} frames"
 
 
-def difference(first: Explained, second: Explained) -> Difference:
-    """Depth residuals of two shapes (or poses) compared frame by frame: what is hard to see in a frame (its noise, its
-    outline) is in both, and cancels.
+def depth_of(row: Float[Array, "5"]) -> float:
+    """Of a frame's residuals that of depth (m)."""
+    return float(row[2])
+
+
+def difference(
+    first: Explained, second: Explained, value: Callable[[Float[Array, "5"]], float] = depth_of
+) -> Difference:
+    """Residuals (a `value` of each frame's row) of two shapes or poses compared frame by frame: what is hard to see in
+    a frame (its noise, its outline) is in both, and cancels.
 
     Neighbouring frames see the same faces: with r their correlation, n of them are worth n (1 - r) / (1 + r).
     """
-    a, b = ({(int(r[0]), int(r[1])): float(r[2]) for r in rows} for rows in (first.rows, second.rows))
+    a, b = ({(int(r[0]), int(r[1])): value(r) for r in rows} for rows in (first.rows, second.rows))
     both = [place for place in a if place in b]
     if not both:
         return Difference(float("nan"), float("nan"), 0, 0.0)

@@ -10,7 +10,7 @@ Both are optional: what is not there is not shown.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -95,25 +95,23 @@ def read_notes(folder: Path, toss: int) -> TrackNotes | None:
 
 
 def find_notes(results: Results, stage: str, toss: int) -> TrackNotes | None:
-    """Notes of the track in a stage's folder, or of the track that this stage was made from (which has an object frame
-    of its own: its rejected poses are left out)."""
-    here = read_notes(results.path / stage, toss)
-    if here is not None:
+    """Notes of the track in a stage's folder; what is not there (matches, where poses were refined) of the track that
+    this stage was made from, which has an object frame of its own: its rejected poses are left out."""
+    here, before = read_notes(results.path / stage, toss), _made_from(results, stage, toss)
+    found = None if before is None else find_notes(results, before, toss)
+    if found is None:
         return here
-    before = _made_from(results, stage, toss)
-    if before is None:
-        return None
-    found = find_notes(results, before, toss)
-    return (
-        None if found is None else TrackNotes(found.residual, found.on_surface, found.keyframes, matches=found.matches)
-    )
+    if here is None:
+        return TrackNotes(found.residual, found.on_surface, found.keyframes, matches=found.matches)
+    return here if len(here.matches.frames) else replace(here, matches=found.matches)
 
 
 def _made_from(results: Results, stage: str, toss: int) -> str | None:
     """The stage folder that holds the track of this toss from which a stage was made."""
     try:
-        key = results.stage(stage).get("inputs", {}).get(f"track_{toss:02d}")
+        inputs = results.stage(stage).get("inputs", {})
     except BadInput:
         return None
+    key = inputs.get(f"track_{toss:02d}") or inputs.get("before")
     fitting = sorted(results.path.glob(f"*-{str(key)[:8]}")) if key else []
     return fitting[0].name if fitting else None

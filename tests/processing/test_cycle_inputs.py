@@ -67,8 +67,8 @@ def test_a_shape_that_fits_worse_in_every_frame_is_worse_however_noisy_the_frame
     noise = np.random.default_rng(0).normal(1.4e-3, 0.3e-3, 40)
     gap = difference(rows(noise), rows(noise + 2e-4))
     assert gap.worse
-    assert gap.mean_m == pytest.approx(2e-4)
-    assert gap.error_m < 1e-9
+    assert gap.mean == pytest.approx(2e-4)
+    assert gap.error < 1e-9
     assert not difference(rows(noise + 2e-4), rows(noise)).worse
 
 
@@ -110,7 +110,7 @@ def test_only_frames_that_both_know_are_compared() -> None:
     first, second = rows(np.full(6, 1e-3)), rows(np.full(6, 1e-3))
     second.rows[2, 1], second.rows[2, 2] = 99, 1.0
     gap = difference(first, second)
-    assert (gap.frames, gap.mean_m) == (5, 0.0)
+    assert (gap.frames, gap.mean) == (5, 0.0)
     nothing = difference(first, Explained(np.zeros((0, 5)), 6))
     assert nothing.frames == 0
     assert not nothing.worse

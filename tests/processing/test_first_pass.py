@@ -70,7 +70,7 @@ def test_a_toss_that_is_turned_against_the_others_is_kept_apart(
     session = Session.open(tiny_world.record(tmp_path / "tiny", tosses=(0, 1, 2), frames=6))
     run = start_run(session, session.tosses, tmp_path / "out", Config(), "multi-hypothesis", lambda _: Silent())
     together, images = stages(tiny_world, run, tmp_path, turned)
-    fused = fuse_frames(run, together, images, session.tosses)
+    fused = fuse_frames(run, dict.fromkeys(session.tosses, together), images)
     assert kept_apart(run, together, fused, images, session.tosses) == apart
 
 
@@ -80,15 +80,18 @@ def test_tosses_whose_masks_are_bad_alike_are_not_kept_apart(tiny_world: Any, tm
     run = start_run(session, session.tosses, tmp_path / "out", Config(), "multi-hypothesis", lambda _: Silent())
     together, images = stages(tiny_world, run, tmp_path, None, narrower_px=2)
     true_images = stages(tiny_world, run, tmp_path / "true", None)[1]
-    fused = fuse_frames(run, together, true_images, (0, 1))
+    fused = fuse_frames(run, dict.fromkeys((0, 1), together), true_images)
     left = _left(run, together, dict.fromkeys((0, 1), fused), images)
     assert max(left.values()) > run.config.cycle.apart_mask
-    assert kept_apart(run, together, fuse_frames(run, together, images, (0, 1)), images, [0, 1]) == ()
+    badly = fuse_frames(run, dict.fromkeys((0, 1), together), images)
+    assert kept_apart(run, together, badly, images, [0, 1]) == ()
 
 
+@pytest.mark.parametrize("found_again", [False, True])
 def test_the_others_are_joined_anew_without_a_toss_that_is_kept_apart(
-    tiny_world: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tiny_world: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, found_again: bool
 ) -> None:
+    """And it is one of them after all, where it is found on their shape."""
     session = Session.open(tiny_world.record(tmp_path / "tiny", tosses=(0, 1, 2), frames=2))
     run = start_run(session, session.tosses, tmp_path / "out", Config(), "multi-hypothesis", lambda _: Silent())
     alone = {t: Done(tmp_path, f"track {t}", TrackResult(2, 0, 0, unfit=int(t == 1)), False) for t in run.tosses}
@@ -102,10 +105,20 @@ def test_the_others_are_joined_anew_without_a_toss_that_is_kept_apart(
     def apart(_: Run, __: Done, ___: Done, ____: Any, joined: list[int]) -> tuple[int, ...]:
         return tuple(t for t in joined if t == 1)
 
-    for name, fake in (("register", register), ("learn_field", field), ("kept_apart", apart)):
+    def fuse(_: Run, tracks: dict[int, Done], __: Any) -> Done:
+        return Done(tmp_path, f"fused {sorted(tracks)}", None, False)
+
+    def located(_: Run, __: Any, joined: dict[int, Done], missing: list[int]) -> dict[int, Done]:
+        assert (sorted(joined), missing) == ([0, 2], [1])
+        return {1: Done(tmp_path, "located", None, False)} if found_again else {}
+
+    fakes = {"register": register, "learn_field": field, "kept_apart": apart, "fuse_frames": fuse, "located": located}
+    for name, fake in fakes.items():
         monkeypatch.setattr(first_pass, name, fake)
+    monkeypatch.setattr(first_pass, "cross_fitted", lambda _, __, tracks, ___: tracks)
     found = first_pass.first_pass(run, alone, {})
-    assert {t: d.key for t, d in found.tracks.items()} == {0: "together [0, 2]", 2: "together [0, 2]"}
-    assert {d.key for d in found.shapes.values()} == {"all tosses [0, 2]"}
-    assert not found.shared_frame
-    assert [w.text.split(":")[0] for w in found.warnings] == ["toss 1", "tosses [1]"]
+    others = {0: "together [0, 2]", 2: "together [0, 2]"}
+    assert {t: d.key for t, d in found.tracks.items()} == (others | {1: "located"} if found_again else others)
+    assert {d.key for d in found.shapes.values()} == {f"all tosses {sorted(found.tracks)}"}
+    assert found.shared_frame == found_again
+    assert any("kept apart" in w.text for w in found.warnings) != found_again

@@ -1,0 +1,128 @@
+"""Cross-fitting of the first pass: each toss is tracked again on the shape that the other tosses show.
+
+A shape fused from a toss's own frames repeats the errors of its poses, and so confirms them; the errors of the other
+tosses are independent of them (leave-one-out, Stone 1974). What decides between a toss's tracks is how well its frames
+agree with their own fusion at the poses: a wrong pose blurs the surface, and the outlines contradict it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray as Array
+
+from processing.images import Images
+from processing.refine.image_residuals import FAR_M, Explained, difference
+from processing.run import Run, each
+from processing.stages.fuse import fuse_frames
+from processing.stages.judge import judge, residuals
+from processing.stages.track import TrackResult, track
+from processing.store import Done
+from recordings.errors import BadInput
+
+TURNS = 2
+"""The second turn's shapes are fused from what the first one corrected; a third changes poses by less than .1 mm."""
+FOLDS = 3
+"""Into so many parts many tosses are split, each tracked on the others' shape; fewer tosses are left out singly."""
+
+
+def cross_fitted(
+    run: Run, images: Mapping[int, Images], tracks: Mapping[int, Done], alone: Mapping[int, Done[TrackResult]]
+) -> dict[int, Done]:
+    """The tracks of tosses in one object frame, each the best of: what it was, refined on the others' shape, and, of a
+    toss that tracked `alone` left a rotation open or lost frames, the object located anew on that shape."""
+    best, results = dict(tracks), {t: alone[t].result for t in tracks}
+    if len(best) < 2:
+        return best
+    for _ in range(TURNS):
+        before = dict(best)
+        for fold in worst_first(run, best, images):
+            shape = fused(run, without(best, fold), images)
+            if shape is None:  # nothing that the others show is sure
+                continue
+            found = refitted(run, {t: best[t] for t in fold}, shape, images, results)
+            results |= {t: done.result for t, done in found.items() if done.key != best[t].key}
+            best |= found
+        if all(best[t].key == before[t].key for t in best):
+            break
+    return best
+
+
+def fused(run: Run, tracks: Mapping[int, Done], images: Mapping[int, Images], unsure: bool = False) -> Done | None:
+    """The surface that tosses show; None where no frame of theirs has a (sure) pose, or too little depth."""
+    try:
+        return fuse_frames(run, tracks, images, unsure)
+    except BadInput:
+        return None
+
+
+def refitted(
+    run: Run, tracks: Mapping[int, Done], shape: Done, images: Mapping[int, Images], results: Mapping[int, TrackResult]
+) -> dict[int, Done]:
+    """Tosses on the shape of others; `results`: how sure each one's track was."""
+    return each(run, tracks, lambda t: chosen(run, tracks[t], shape, images[t], is_open(run, results[t])))
+
+
+def worst_first(run: Run, tracks: Mapping[int, Done], images: Mapping[int, Images]) -> list[tuple[int, ...]]:
+    """The tosses by how badly they fit themselves, in folds: what fits worst is corrected first, on the shape of what
+    fits better, and the next fold on the shape of what was corrected. (All at once would exchange the places of two
+    tosses that lie wrongly to each other, and never join them.)"""
+    misfits = each(run, tracks, lambda t: misfit(on_itself(run, tracks[t], images[t])))
+    order = sorted(tracks, key=lambda t: -misfits[t])
+    return [tuple(int(t) for t in part) for part in np.array_split(order, min(FOLDS, len(order)))]
+
+
+def chosen(run: Run, before: Done, shape: Done, images: Images, anew: bool) -> Done:
+    """Of one toss: the track that it had or that refined on a shape, whichever fits itself better; or the object
+    located `anew` on it, where that fits better by more than chance: the frames have to tell another way of lying."""
+    ways: dict[str, Callable[[], Done | None]] = {"refined": lambda: track(run, images, shape, before=before)}
+    ways |= {"anew": lambda: located_on(run, images, shape)} if anew else {}
+    tried = each(run, ways, lambda way: ways[way]())
+    found = {"before": before, **{way: done for way, done in tried.items() if done is not None}}
+    seen = each(run, found, lambda way: on_itself(run, found[way], images))
+    best = min((way for way in found if way != "anew"), key=lambda way: misfit(seen[way]))
+    if "anew" in found and misfit(seen["anew"]) < misfit(seen[best]):
+        gap = difference(seen["anew"], seen[best], misfit_of)
+        best = "anew" if gap.mean > gap.by_chance else best
+    return found[best]
+
+
+def located_on(run: Run, images: Images, shape: Done) -> Done | None:
+    """One toss tracked on a shape from the start; None where the shape fits nothing that its first frame shows."""
+    try:
+        return track(run, images, shape)
+    except BadInput:
+        return None
+
+
+def without(tracks: Mapping[int, Done], fold: Iterable[int]) -> dict[int, Done]:
+    """The tracks of the other tosses."""
+    return {t: done for t, done in tracks.items() if t not in fold}
+
+
+def is_open(run: Run, result: TrackResult) -> bool:
+    """Whether more frames than an impact blurs have no sure pose."""
+    return result.interpolated + result.lost > run.config.track.hypotheses.impacts * result.frames
+
+
+def on_itself(run: Run, done: Done, images: Images) -> Explained:
+    """The residuals of a toss's raw images against their own fusion at a track's poses."""
+    toss, own = images.toss, {images.toss: images}
+    shape = fused(run, {toss: done}, own, unsure=True)
+    if shape is None:
+        return Explained(np.zeros((0, 5)), 1)
+    return residuals(judge(run, f"toss {toss} on itself", {toss: done}, {toss: shape}, own))
+
+
+def misfit(seen: Explained) -> float:
+    """How badly frames fit: the mean of their misfits, with that of frames without a pose at its worst."""
+    each_frame = [misfit_of(row) for row in seen.rows] + [float(np.log(FAR_M))] * seen.lost
+    return float(np.mean(each_frame)) if each_frame else float("inf")
+
+
+def misfit_of(row: Float[Array, "5"]) -> float:
+    """Of a frame: the logarithm of depth's residual (m) times the outline's (1 - IoU). Its colours are left out: a body
+    that is thought not to turn keeps the shading that stays with the room."""
+    return float(np.log(max(row[2], 1e-6)) + np.log(max(row[3], 1e-6)))

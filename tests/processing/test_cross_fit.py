@@ -1,0 +1,213 @@
+"""Cross-fitting: a toss is tracked again on the shape of the others, and keeps what fits itself best."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from processing.config import Config
+from processing.images import Images, TossImages
+from processing.pipeline import cross_fit, first_pass
+from processing.pipeline.start import start_run
+from processing.refine.image_residuals import Explained
+from processing.run import Run
+from processing.stages.track import TrackResult
+from processing.store import Done
+from recordings.errors import BadInput
+from recordings.geometry import rotation_angle_rad, rotation_exp
+from recordings.progress import Silent
+from recordings.results.folder import read_track, write_masks, write_track
+from recordings.session import Session
+from recordings.tracks import ObjectTrack
+
+SURE = TrackResult(frames=8, interpolated=0, lost=0)
+TURN = np.array([0.0, 0.0, np.radians(10)])
+
+
+def seen(depth_mm: Any, frames: int = 10) -> Explained:
+    """Residuals of frames whose outlines fit alike."""
+    depth_m = 1e-3 * np.broadcast_to(np.asarray(depth_mm, dtype=np.float64), frames)
+    index = np.arange(frames, dtype=np.float64)
+    return Explained(np.stack([0 * index, index, depth_m, np.full(frames, 0.1), np.full(frames, np.nan)], 1), 0)
+
+
+class Tosses:
+    """Tosses of the box with true masks, and tracks of them whose poses may be turned more and more as time goes."""
+
+    def __init__(self, tiny_world: Any, folder: Path, count: int, frames: int = 8) -> None:
+        session = Session.open(tiny_world.record(folder / "tiny", tosses=tuple(range(count)), frames=frames))
+        self.run: Run = start_run(
+            session, session.tosses, folder / "out", Config(), "multi-hypothesis", lambda _: Silent()
+        )
+        self.images: dict[int, Images] = {}
+        self._world, self._folder, self._frames = tiny_world, folder, frames
+        for toss in session.tosses:
+            own = folder / f"segment-{toss}"
+            own.mkdir()
+            masks = [tiny_world.see(p, i)[1] for i, p in enumerate(tiny_world.poses(frames, toss))]
+            write_masks(own, toss, masks, np.ones(frames))
+            rgbd = session.toss(toss).rgbd()
+            seen = TossImages(rgbd, rgbd.depth_times_ns, masks, np.ones(frames), None, None)
+            self.images[toss] = Images(toss, {"masks": f"masks {toss}"}, lambda seen=seen: seen)
+
+    def truth(self, toss: int) -> np.ndarray:
+        """camera_from_object of every frame."""
+        camera_from_world = self._world.world_from_camera.inverse()
+        return np.stack([(camera_from_world @ p).matrix for p in self._world.poses(self._frames, toss)])
+
+    def track(self, toss: int, turn: np.ndarray, name: str) -> Done:
+        """The true poses, turned by up to `turn` (rotation vector, object frame) towards the end."""
+        poses = self.truth(toss)
+        for i, pose in enumerate(poses):
+            pose[:3, :3] = pose[:3, :3] @ rotation_exp(turn * i / (len(poses) - 1))
+        folder = self._folder / name
+        folder.mkdir()
+        times_ns, n = self.run.session.toss(toss).rgbd().times_ns, len(poses)
+        status: Any = ("tracked",) * n
+        write_track(
+            folder, ObjectTrack(toss, "d455", "object", times_ns, poses, status, np.tile(1e-6 * np.eye(6), (n, 1, 1)))
+        )
+        return Done(folder, name, SURE, False)
+
+    def misfit(self, done: Done) -> float:
+        """Of toss 0."""
+        return cross_fit.misfit(cross_fit.on_itself(self.run, done, self.images[0]))
+
+    def off_deg(self, toss: int, done: Done) -> float:
+        """Largest rotation error of a track, from its first frame on."""
+        found, true = read_track(done.folder, toss).camera_from_object, self.truth(toss)
+        steps = [np.linalg.inv(p[0]) @ p[k] for k in range(len(true)) for p in (found, true)]
+        return max(
+            np.degrees(rotation_angle_rad(a[:3, :3].T @ b[:3, :3]))
+            for a, b in zip(steps[::2], steps[1::2], strict=True)
+        )
+
+
+def test_wrong_poses_fit_their_own_frames_worse(tiny_world: Any, tmp_path: Path) -> None:
+    tosses = Tosses(tiny_world, tmp_path, 1)
+    misfits = [tosses.misfit(tosses.track(0, k * TURN, f"track-{k}")) for k in range(3)]
+    assert misfits == sorted(misfits)
+    assert misfits[2] > misfits[0] + 0.3
+
+
+def test_a_frame_without_a_pose_is_no_way_to_fit_better(tiny_world: Any, tmp_path: Path) -> None:
+    tosses = Tosses(tiny_world, tmp_path, 1)
+    whole = tosses.track(0, 0 * TURN, "track-whole")
+    track = read_track(whole.folder, 0)
+    poses = track.camera_from_object.copy()
+    poses[4] = np.nan
+    status = tuple("lost" if i == 4 else s for i, s in enumerate(track.status))
+    less = tmp_path / "track-less"
+    less.mkdir()
+    write_track(less, replace(track, camera_from_object=poses, status=status))
+    assert tosses.misfit(Done(less, "less", SURE, False)) > tosses.misfit(whole)
+
+
+def test_a_toss_that_drifted_is_put_right_on_the_shape_of_the_other(tiny_world: Any, tmp_path: Path) -> None:
+    tosses = Tosses(tiny_world, tmp_path, 2)
+    tracks = {0: tosses.track(0, 0 * TURN, "track-0"), 1: tosses.track(1, TURN, "track-1")}
+    alone: Any = {t: Done(tmp_path, f"alone-{t}", SURE, False) for t in tracks}
+    fitted = cross_fit.cross_fitted(tosses.run, tosses.images, tracks, alone)
+    assert tosses.off_deg(1, tracks[1]) > 9
+    assert tosses.off_deg(1, fitted[1]) < 2
+    assert tosses.off_deg(0, fitted[0]) < 2
+
+
+def test_the_worst_toss_comes_first_and_every_toss_once(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, tiny_world: Any
+) -> None:
+    tosses = Tosses(tiny_world, tmp_path, 1)
+    run, images = tosses.run, dict.fromkeys(range(7), tosses.images[0])
+    monkeypatch.setattr(cross_fit, "on_itself", lambda _, done, __: seen({"3": 5.0, "6": 4.0}.get(done.key, 1.0)))
+    folds = cross_fit.worst_first(run, {t: Done(tmp_path, str(t), None, False) for t in range(7)}, images)
+    assert folds[0][:2] == (3, 6)
+    assert len(folds) == cross_fit.FOLDS
+    assert sorted(t for fold in folds for t in fold) == list(range(7))
+
+
+def test_one_toss_stays_as_it_is(tiny_world: Any, tmp_path: Path) -> None:
+    tosses = Tosses(tiny_world, tmp_path, 1)
+    only = {0: tosses.track(0, TURN, "track-0")}
+    alone: Any = {0: Done(tmp_path, "alone-0", SURE, False)}
+    assert cross_fit.cross_fitted(tosses.run, tosses.images, only, alone) == only
+
+
+class Tried:
+    """Stands for the stage `track` and what its tracks leave: depth residuals (mm) of ten frames by way."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, folder: Path, **depth_mm: Any) -> None:
+        self.asked: list[str] = []
+
+        def track(_: Any, __: Any, ___: Done, before: Done | None = None) -> Done:
+            self.asked.append("anew" if before is None else "refined")
+            return Done(folder, self.asked[-1], None, False)
+
+        monkeypatch.setattr(cross_fit, "track", track)
+        monkeypatch.setattr(cross_fit, "on_itself", lambda _, done, __: seen(depth_mm[done.key]))
+        self.before, self.shape = (Done(folder, name, None, False) for name in ("before", "shape"))
+
+
+@pytest.mark.parametrize(("frames", "sought"), [((40, 0, 0), False), ((40, 4, 0), False), ((40, 3, 2), True)])
+def test_the_object_is_sought_anew_where_frames_are_not_sure(
+    frames: tuple[int, int, int], sought: bool, monkeypatch: pytest.MonkeyPatch, tiny_world: Any, tmp_path: Path
+) -> None:
+    tosses = Tosses(tiny_world, tmp_path, 1)
+    tried = Tried(monkeypatch, tmp_path, before=3.0, refined=2.0, anew=1.0)
+    anew = cross_fit.is_open(tosses.run, TrackResult(*frames))
+    found = cross_fit.chosen(tosses.run, tried.before, tried.shape, tosses.images[0], anew)
+    assert found.key == ("anew" if sought else "refined")
+    assert tried.asked == ["refined", *(["anew"] if sought else [])]
+
+
+@pytest.mark.parametrize(("anew", "taken"), [(1.0, "anew"), ([1.0, 2.9] * 5, "refined"), (2.5, "refined")])
+def test_another_way_of_lying_has_to_fit_better_beyond_chance(
+    anew: Any, taken: str, monkeypatch: pytest.MonkeyPatch, tiny_world: Any, tmp_path: Path
+) -> None:
+    tosses = Tosses(tiny_world, tmp_path, 1)
+    tried = Tried(monkeypatch, tmp_path, before=3.0, refined=2.0, anew=anew)
+    assert cross_fit.chosen(tosses.run, tried.before, tried.shape, tosses.images[0], True).key == taken
+
+
+def test_a_track_that_the_shape_makes_worse_stays(
+    monkeypatch: pytest.MonkeyPatch, tiny_world: Any, tmp_path: Path
+) -> None:
+    tosses = Tosses(tiny_world, tmp_path, 1)
+    tried = Tried(monkeypatch, tmp_path, before=2.0, refined=3.0)
+    assert cross_fit.chosen(tosses.run, tried.before, tried.shape, tosses.images[0], False) is tried.before
+
+
+def test_a_shape_that_fits_nothing_locates_no_toss(
+    monkeypatch: pytest.MonkeyPatch, tiny_world: Any, tmp_path: Path
+) -> None:
+    def track(*_: Any, **__: Any) -> Done:
+        raise BadInput("the given shape fits nothing")
+
+    tosses = Tosses(tiny_world, tmp_path, 1)
+    monkeypatch.setattr(cross_fit, "track", track)
+    assert cross_fit.located_on(tosses.run, tosses.images[0], Done(tmp_path, "shape", None, False)) is None
+
+
+def test_a_toss_that_was_not_joined_is_found_on_the_shape_of_the_others(tiny_world: Any, tmp_path: Path) -> None:
+    tosses = Tosses(tiny_world, tmp_path, 2)
+    joined = {0: tosses.track(0, 0 * TURN, "track-0")}
+    found = first_pass.located(tosses.run, tosses.images, joined, [1])
+    assert set(found) == {1}
+    assert tosses.off_deg(1, found[1]) < 3
+    assert first_pass.located(tosses.run, tosses.images, joined, []) == {}
+
+
+def test_tosses_that_show_nothing_sure_correct_no_other(tiny_world: Any, tmp_path: Path) -> None:
+    """Nor is a track without any pose taken for a fit."""
+    tosses = Tosses(tiny_world, tmp_path, 2)
+    tracks = {0: tosses.track(0, 0 * TURN, "track-0"), 1: tosses.track(1, TURN, "track-1")}
+    for toss, done in tracks.items():
+        track = read_track(done.folder, toss)
+        lost: Any = ("lost",) * 8
+        write_track(done.folder, replace(track, camera_from_object=np.full((8, 4, 4), np.nan), status=lost))
+    alone: Any = {t: Done(tmp_path, f"alone-{t}", SURE, False) for t in tracks}
+    assert cross_fit.cross_fitted(tosses.run, tosses.images, tracks, alone) == tracks
+    assert tosses.misfit(tracks[0]) == pytest.approx(np.log(0.02))
