@@ -23,7 +23,7 @@ from processing.store import Done
 from recordings.errors import BadInput
 
 TURNS = 2
-"""The second turn's shapes are fused from what the first one corrected; a third changes poses by less than .1 mm."""
+"""The second turn is for tosses that the first one left open: on shapes that it corrected."""
 FOLDS = 3
 """Into so many parts many tosses are split, each tracked on the others' shape; fewer tosses are left out singly."""
 
@@ -36,24 +36,25 @@ def cross_fitted(
     best, results = dict(tracks), {t: alone[t].result for t in tracks}
     if len(best) < 2:
         return best
+    again = tuple(best)
     for _ in range(TURNS):
-        before = dict(best)
-        for fold in worst_first(run, best, images):
+        for fold in worst_first(run, {t: best[t] for t in again}, images):
             shape = fused(run, without(best, fold), images)
             if shape is None:  # nothing that the others show is sure
                 continue
             found = refitted(run, {t: best[t] for t in fold}, shape, images, results)
             results |= {t: done.result for t, done in found.items() if done.key != best[t].key}
             best |= found
-        if all(best[t].key == before[t].key for t in best):
+        again = tuple(t for t in again if is_open(run, results[t]))
+        if not again:
             break
     return best
 
 
-def fused(run: Run, tracks: Mapping[int, Done], images: Mapping[int, Images], unsure: bool = False) -> Done | None:
+def fused(run: Run, tracks: Mapping[int, Done], images: Mapping[int, Images], draft: bool = False) -> Done | None:
     """The surface that tosses show; None where no frame of theirs has a (sure) pose, or too little depth."""
     try:
-        return fuse_frames(run, tracks, images, unsure)
+        return fuse_frames(run, tracks, images, draft)
     except BadInput:
         return None
 
@@ -110,7 +111,7 @@ def is_open(run: Run, result: TrackResult) -> bool:
 def on_itself(run: Run, done: Done, images: Images) -> Explained:
     """The residuals of a toss's raw images against their own fusion at a track's poses."""
     toss, own = images.toss, {images.toss: images}
-    shape = fused(run, {toss: done}, own, unsure=True)
+    shape = fused(run, {toss: done}, own, draft=True)
     if shape is None:
         return Explained(np.zeros((0, 5)), 1)
     return residuals(judge(run, f"toss {toss} on itself", {toss: done}, {toss: shape}, own))

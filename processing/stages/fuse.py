@@ -11,10 +11,12 @@ from processing.field.learn import chosen_views
 from processing.field.mesh import grid_mesh
 from processing.images import Images, track_and_image_keys
 from processing.run import Run
-from processing.store import Done
+from processing.store import Done, plain
 from recordings.results.folder import read_track, write_shape
 
 VERSION = 6
+DRAFT = 2.0
+"""Of a draft the cells are so many times as wide: far narrower than the band around a surface all the same."""
 
 
 @dataclass(frozen=True)
@@ -26,21 +28,23 @@ class FuseResult:
 
 
 def fuse_frames(
-    run: Run, tracks: Mapping[int, Done], images: Mapping[int, Images], unsure: bool = False
+    run: Run, tracks: Mapping[int, Done], images: Mapping[int, Images], draft: bool = False
 ) -> Done[FuseResult]:
-    """The surface that these tosses' frames show at their tracks' poses, which are in one object frame; with `unsure`
-    those whose pose is not sure too."""
-    inputs = track_and_image_keys(tracks, images) | ({"unsure": "too"} if unsure else {})
+    """The surface that these tosses' frames show at their tracks' poses, which are in one object frame. A `draft` is
+    for judging the poses: coarser, and of frames whose pose is not sure too."""
+    inputs = track_and_image_keys(tracks, images)
+    config = run.config.shape.field.fuse
+    config = replace(config, voxel_m=DRAFT * config.voxel_m) if draft else config
 
     def compute(folder: Path) -> FuseResult:
         found = {t: read_track(done.folder, t) for t, done in tracks.items()}
-        if unsure:
+        if draft:
             found = {
                 t: replace(f, status=tuple("lost" if gone else "tracked" for gone in f.lost)) for t, f in found.items()
             }
         seen = [images[t].open().views(track) for t, track in found.items()]
         views = chosen_views(seen, run.camera, run.config.shape)
-        write_shape(folder, grid_mesh(fuse(views, run.config.shape.field.fuse), seen[0].track.object_frame))
+        write_shape(folder, grid_mesh(fuse(views, config), seen[0].track.object_frame))
         return FuseResult(tuple(tracks), len(views))
 
-    return run.store.run("fuse", VERSION, run.config.shape.field.fuse, inputs, FuseResult, compute)
+    return run.store.run("fuse", VERSION, {**plain(config), "draft": draft}, inputs, FuseResult, compute)
