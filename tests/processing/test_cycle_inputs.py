@@ -93,7 +93,7 @@ def test_frames_that_are_alike_are_worth_fewer() -> None:
     alone, alike = (difference(rows(before, 2), rows(before + x, 2)) for x in (single, runs))
     assert alone.independent > 80
     assert alike.independent < 30
-    assert alike.error_m > 1.7 * alone.error_m
+    assert alike.error > 1.7 * alone.error
 
 
 def test_equal_shapes_are_rarely_called_worse_although_neighbouring_frames_are_alike() -> None:
