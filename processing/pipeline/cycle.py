@@ -124,7 +124,7 @@ def tracked_again(
 
     def drawn_and_tracked(toss: int) -> tuple[Done, Done]:
         drawn = reproject(run, name, refined.tracks[toss], shape, images[toss], icp)
-        return drawn, track(run, drawn_images(run, drawn, shape, images[toss]), shape, before=drawn)
+        return drawn, track(run, drawn_images(run, drawn, shape, images[toss]), shape, drawn, run.config.cycle.start)
 
     done = each(run, images, drawn_and_tracked)
     drawn, tracks = ({t: d[k] for t, d in done.items()} for k in (0, 1))

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from processing.backends import matcher_of
+from processing.config import SecondPassStart
 from processing.images import Images
 from processing.run import CAMERA, Run, matcher_settings
 from processing.store import Done
@@ -33,9 +34,12 @@ class TrackResult:
     unfit: int = 0
 
 
-def track(run: Run, images: Images, model: Done | None = None, before: Done | None = None) -> Done[TrackResult]:
-    """p_i, from the toss alone; with `model` in a learned shape's object frame. `before`: the second pass begins with
-    these poses (and the `model`, or anew with the first pose alone: `CycleConfig.start`)."""
+def track(
+    run: Run, images: Images, model: Done | None = None, before: Done | None = None,
+    start_with: SecondPassStart = "shape",
+) -> Done[TrackResult]:  # fmt: skip
+    """p_i, from the toss alone; with `model` in a learned shape's object frame. `before`: it starts with these poses
+    and the `model`, with the poses alone, or `anew` with the first one."""
     inputs = {**images.inputs}
     inputs |= {} if model is None else {"model": model.key}
     inputs |= {} if before is None else {"before": before.key}
@@ -43,7 +47,7 @@ def track(run: Run, images: Images, model: Done | None = None, before: Done | No
     inputs |= {} if start is None else {"start": start.digest}
 
     def compute(folder: Path) -> TrackResult:
-        known = _known(run, images.toss, model, before)
+        known = _known(run, images.toss, model, before, start_with)
         if known is None:  # nothing to begin the second pass with
             assert before is not None
             lost = read_track(before.folder, images.toss)
@@ -62,14 +66,16 @@ def track(run: Run, images: Images, model: Done | None = None, before: Done | No
         return _result(tracked.track, tracked.unfit)
 
     config = matcher_settings(run, run.config.track)
-    config |= {} if before is None else {"second_pass": run.config.cycle.start}
+    config |= {} if before is None else {"second_pass": start_with}
     return run.store.run("track", VERSION, config, inputs, TrackResult, compute)
 
 
-def _known(run: Run, toss: int, model: Done | None, before: Done | None) -> dict[str, Any] | None:
+def _known(
+    run: Run, toss: int, model: Done | None, before: Done | None, start_with: SecondPassStart
+) -> dict[str, Any] | None:
     """What `track_toss` is told; None where a second pass has no pose to begin with."""
     if before is not None:
-        return _second(run, toss, model, before)
+        return _second(toss, model, before, start_with)
     if model is not None:
         shape = read_shape(model.folder)
         return {"model": shape, "object_frame": shape.object_frame}
@@ -79,16 +85,16 @@ def _known(run: Run, toss: int, model: Done | None, before: Done | None) -> dict
     return {"object_frame": "object", "start": start.camera_from_object, "start_frame": start.frame}
 
 
-def _second(run: Run, toss: int, model: Done | None, before: Done) -> dict[str, Any] | None:
+def _second(toss: int, model: Done | None, before: Done, start_with: SecondPassStart) -> dict[str, Any] | None:
     track = read_track(before.folder, toss)
     known = np.flatnonzero(np.isfinite(track.camera_from_object[:, 0, 0]))
     if len(known) == 0:
         return None
     given: dict[str, Any] = {"object_frame": track.object_frame}
-    if run.config.cycle.start == "anew":
+    if start_with == "anew":
         start = Transform.from_matrix(CAMERA, track.object_frame, track.camera_from_object[known[0]])
         return {**given, "start": start, "start_frame": int(known[0])}
-    shape = {"model": read_shape(model.folder)} if model is not None and run.config.cycle.start == "shape" else {}
+    shape = {"model": read_shape(model.folder)} if model is not None and start_with == "shape" else {}
     return {**given, "poses": track.camera_from_object, **shape}
 
 
