@@ -11,7 +11,7 @@ from numpy import ndarray as Array
 
 from processing.contact.learn.shape_comparison import series_of
 from processing.contact.physics.inertia import uniform_physics
-from processing.field.fuse import Grid, fuse
+from processing.field.fuse import fuse
 from processing.field.mesh import grid_mesh
 from processing.live.advice import Option, Throw, options
 from processing.live.config import LiveConfig
@@ -96,7 +96,7 @@ class Together:
         """The shape so far, from some views of each toss that has its place."""
         views = [v for j in self.tosses.values() if j.placed for v in j.looked.views]
         try:
-            self.shape = _painted(fuse(views, self.config.fuse)) if views else None
+            self.shape = grid_mesh(fuse(views, self.config.fuse), SHARED, "so far") if views else None
         except BadInput:  # too few depth points: nothing to show yet
             self.shape = None
 
@@ -152,14 +152,6 @@ class Together:
                 None if not np.isfinite(p).all() else p.tolist() for p in track.camera_from_object
             ),
         )
-
-
-def _painted(grid: Grid) -> ObjectShape:
-    """The grid's surface in the colours that the views saw there."""
-    shape = grid_mesh(grid, SHARED, "so far")
-    cells = np.rint((shape.vertices_m - grid.origin_m) / grid.voxel_m).astype(int)
-    at = tuple(np.clip(cells, 0, np.array(grid.sdf_m.shape) - 1).T)
-    return replace(shape, vertex_rgb=(255 * grid.rgb[at].clip(0, 1)).round().astype(np.uint8))
 
 
 def _moved(tracked: TossTrack, shared_from_own: Float[Array, "4 4"]) -> TossTrack:
