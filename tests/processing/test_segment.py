@@ -94,6 +94,23 @@ def test_an_object_that_hardly_moves_is_followed_by_its_colours(tiny_world: Any)
     assert min(iou(m.mask, t) for m, (_, t) in zip(found, seen)) > 0.8
 
 
+def test_what_stands_behind_a_held_object_stays_scene_once_the_object_has_left() -> None:
+    table = np.ones((90, 120), np.float32)
+    can, places = np.s_[20:60, 50:80], [20, 20, 20, 45, 60, 85, 85, 85]  # the object passes before it, and has left
+
+    def seen(i: int, column: int) -> RgbdFrame:
+        depth, color = table.copy(), np.full((90, 120, 3), 120, np.uint8)
+        depth[can], color[can] = 0.9, (30, 160, 40)
+        held = np.s_[30:50, column : column + 30]
+        depth[held], color[held] = 0.84, (200, 30, 30)
+        return RgbdFrame("d455", i, i, i, color, depth)
+
+    frames = [seen(i, column) for i, column in enumerate(places)]
+    scene = learn_scene(frames, table, SceneSettings(), tosses=[0] * len(frames))
+    assert scene.known[can].all()
+    np.testing.assert_allclose(scene.depth_m[can], 0.9)
+
+
 def test_an_object_that_leaves_the_view_gives_empty_masks_and_comes_back(tiny_world: Any, toss: Any) -> None:
     frames, truth = toss
     away = [tiny_world.see(None, i)[0] if i in (5, 6) else f for i, f in enumerate(frames)]

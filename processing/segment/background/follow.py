@@ -22,7 +22,7 @@ from processing.segment.background.foreground import (
     window_around,
 )
 from processing.segment.background.late_depth import LateDepthSettings, at_color_time, way_px
-from processing.segment.background.others import Others, largest_other, things_near, without_others
+from processing.segment.background.others import Others, expected_pieces, largest_other, things_near, without_others
 from processing.segment.background.placement import best_shift, shifted
 from processing.segment.background.static_scene import StaticScene
 from recordings.records import RgbdFrame
@@ -162,6 +162,8 @@ def follow(
     rough = component_in(sought.own, sought.near)
     if cues is not None:
         rough |= _other_pieces(frame, sought.moved & ~rough, sought.expected, cues, memory, s)
+    elif memory.others is not None:
+        rough |= expected_pieces(sought.own & ~rough, sought.expected, s.piece_px)
     if rough.sum() < s.least_px:
         return Found(np.zeros_like(rough), 0.0)
     unknown = ~scene.known if cues is None else cues.unknown
@@ -224,8 +226,9 @@ def _sought(
     came_px = _best_shift(frame, moved, near, memory, cues, reach)
     expected, own = shifted(memory.mask, came_px), moved
     if memory.others is not None and cues is None:
-        shares = memory.likeness.object_shares
-        own = without_others(frame, scene, moved, expected, came_px, memory.others, shares, reach, s.foreground)
+        own = without_others(
+            frame, scene, moved, expected, came_px, memory.others, memory.likeness, reach, s.foreground
+        )
     return _Sought(moved, own, expected, grown(expected, reach))
 
 
@@ -244,7 +247,7 @@ def _bordered(
         return refine_border(frame, scene, rough, odds, s.foreground, s.piece_px)
     odds = _likeness_near(frame, memory, rough)
     odds[sought.moved & ~sought.own] = -MOST_ODDS
-    return refine_border(frame, scene, rough, odds, s.foreground)
+    return refine_border(frame, scene, rough, odds, s.foreground, None if memory.others is None else s.piece_px)
 
 
 def _found(

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray as Array
 
-from processing.segment.background.color_model import MEMORY, color_shares, shares_log_odds
+from processing.segment.background.color_model import MEMORY, Likeness, color_shares, shares_log_odds
 from processing.segment.background.foreground import (
     ForegroundSettings,
     grown,
@@ -26,6 +26,9 @@ PLACE_PX = 5.0
 """A pixel so much nearer to where the one is expected than to where the other is speaks for it by one nat ..."""
 MOST_PLACE = 3.0
 """... and by no more than this: both may have turned."""
+OWN_NATS = 1.0
+"""A colour that speaks so much more for the object than for its surroundings is its own, also where it may be a shade
+of the scene's: a dark bottle is, of any table."""
 DEPTH_EDGE_M = 0.02
 """A step of depth this large between neighbours cuts their pull as a strong edge of colour does."""
 
@@ -82,7 +85,7 @@ def without_others(
     expected: Bool[Array, "h w"],
     way_px: Float[Array, "2"],
     others: Others,
-    object_shares: Float[Array, " b"],
+    likeness: Likeness,
     reach_px: int,
     s: ForegroundSettings,
 ) -> Bool[Array, "h w"]:
@@ -96,15 +99,25 @@ def without_others(
     at = window_around(expected | others.mask, reach_px)
     if at is None:
         return out
-    odds = shares_log_odds(frame.color_rgb[at], object_shares, others.shares)
+    odds = shares_log_odds(frame.color_rgb[at], likeness.object_shares, others.shares)
     score = moved[at] / (1 + np.exp(odds))
     theirs = shifted(others.mask[at], best_shift(score.astype(np.float32), others.mask[at], way_px, 1, reach_px))
     place = np.clip((_away(theirs) - _away(expected[at])) / PLACE_PX, -MOST_PLACE, MOST_PLACE)
     odds = np.where(moved[at], s.weight_likeness * odds + place, 0.0).astype(np.float32)
     depth = np.where(frame.depth_m[at] > 0, frame.depth_m[at], np.float32(0)) * np.float32(s.edge_color / DEPTH_EDGE_M)
     belief = smooth(odds, np.dstack([frame.color_rgb[at].astype(np.float32), depth]), s)
-    out[at] = moved[at] & (belief > 0) & (expected[at] | ~scene_colored(frame, scene, at, s))
+    own = expected[at] | ~scene_colored(frame, scene, at, s) | (likeness.log_odds(frame.color_rgb[at]) > OWN_NATS)
+    out[at] = moved[at] & (belief > 0) & own
     return out
+
+
+def expected_pieces(own: Bool[Array, "h w"], expected: Bool[Array, "h w"], least_px: int) -> Bool[Array, "h w"]:
+    """What a hand has cut off the object: pieces of what is its own, most of which lie where it is expected."""
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(own.astype(np.uint8), connectivity=4)
+    inside = np.bincount(labels[expected], minlength=count)
+    kept = (stats[:, cv2.CC_STAT_AREA] >= least_px) & (inside > 0.5 * stats[:, cv2.CC_STAT_AREA])
+    kept[0] = False
+    return np.asarray(kept[labels])
 
 
 def largest_other(

@@ -27,6 +27,7 @@ from processing.segment.background.foreground import grown, moved_pixels, refine
 from processing.segment.background.others import things_near
 from processing.segment.background.static_scene import (
     StaticScene,
+    bare_table,
     colorless,
     leveled,
     surroundings,
@@ -222,7 +223,7 @@ class BackgroundSegmenter:
         return follow(frame, with_robot(scene, frame, seen, s), memory, certain, cues, self._settings)
 
     def _scene_without(self, frame: RgbdFrame, mask: Bool[Array, "h w"]) -> StaticScene:
-        moved = moved_pixels(frame, self._scene, self._settings.foreground)
+        moved = moved_pixels(frame, self._scene, self._settings.foreground) | bare_table(self._scene)
         stands_out = (moved & mask).sum() >= self._settings.part_of_scene * mask.sum()
         # before the table, depth decides what the scene's unknown colour cannot
         unknown = (~self._scene.known & (self._scene.depth_m == 0) & surroundings(mask)).sum()

@@ -21,6 +21,9 @@ from recordings.records import RgbdFrame
 from recordings.results.stage_files import stage_arrays
 from recordings.tracks import RigCalibration
 
+TABLE_M = 0.008
+"""What lies so near to the calibrated table (or 4 standard deviations of depth) is the table."""
+
 
 @dataclass(frozen=True)
 class SceneSettings:
@@ -34,12 +37,14 @@ class SceneSettings:
     """A pixel whose depth agrees with the scene in fewer frames has no scene depth."""
     table_observations: int = 3
     """What stands in front of the table is not the scene where the table was seen in so many frames."""
-    stands_m: float = 0.008
+    stands_m: float = TABLE_M
     """What is higher above the table (or 4 standard deviations of depth) stands on it."""
     always_share: float = 0.97
     """What returned a pixel's depth more often than this was always there."""
     arrived_share: float = 0.1
     """A thing came to where it stands when the table was seen at other times beneath so much of it."""
+    left_share: float = 0.8
+    """It has left where so much of that table is seen."""
     object_m: float = 0.1
     """Nearer and farther than that part the thing reaches no more than this."""
     returns_share: float = 0.3
@@ -127,9 +132,9 @@ def learn_scene(
     rows = in_parts(learn_rows, height, 40)
     depth, sigma, color, color_sigma, known, share = (np.concatenate(part) for part in zip(*rows))
     never_bare = np.zeros_like(known)
-    for first, last in _ends(tosses, len(depths)):
-        for end in {first, last}:
-            never_bare |= _always_covered(depths[end], depth, share, table, settings)
+    ends = [depths[i] for i in sorted({i for pair in _ends(tosses, len(depths)) for i in pair})]
+    for end in ends:
+        never_bare |= _always_covered(end, ends, depth, share, table, settings)
     known = ~_without_thin_lines(~known | never_bare)
     if known.mean() < settings.still_share:
         raise BadInput(
@@ -149,6 +154,7 @@ def _ends(tosses: Sequence[int] | None, count: int) -> list[tuple[int, int]]:
 
 def _always_covered(
     depth_m: Float32[Array, "h w"],
+    ends: Sequence[Float32[Array, "h w"]],
     scene_m: Float32[Array, "h w"],
     share: Float32[Array, "h w"],
     table_m: Float32[Array, "h w"],
@@ -158,15 +164,16 @@ def _always_covered(
     something else was in front of them at all other times, so what is beneath was never seen.
 
     What stands there in that frame is no part of the scene where the table was seen beneath much of it at other times;
-    the rest of it, which was not always there, isn't either.
+    the rest of it, which was not always there, isn't either: but for what stays in any other of the tosses' `ends` that
+    shows the table beneath the thing, which has left (a can that stands behind it).
     """
     import cv2
 
     lift = np.maximum(settings.stands_m, 4 * stereo_sigma_m(table_m))
     stands = (depth_m > 0) & (table_m - depth_m > lift)
     above = (scene_m > 0) & (table_m - scene_m > lift)
-    uncertain = stands & above & (share < settings.always_share)
-    uncertain &= np.abs(depth_m - scene_m) < np.maximum(0.006, 5 * stereo_sigma_m(scene_m))
+    near_m = np.maximum(0.006, 5 * stereo_sigma_m(scene_m))
+    uncertain = stands & above & (share < settings.always_share) & (np.abs(depth_m - scene_m) < near_m)
     out = np.zeros_like(stands)
     if not uncertain.any():
         return out
@@ -179,7 +186,11 @@ def _always_covered(
             continue
         near, far = np.quantile(depth_m[came], (0.02, 0.98))
         inside = (depth_m > near - settings.object_m) & (depth_m < far + settings.object_m)
-        out |= thing & uncertain & inside
+        stays = np.zeros_like(thing)
+        for other in ends:
+            shown = (other > 0) & (np.abs(other - scene_m) < near_m)
+            stays |= shown & (shown[came].mean() > settings.left_share)
+        out |= thing & uncertain & inside & ~stays
     solid = cv2.morphologyEx(out.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))  # no flickering edges
     grown = cv2.dilate(solid, np.ones((5, 5), np.uint8)) > 0
     return grown & (above | (scene_m == 0))
@@ -323,10 +334,17 @@ def with_object_removed(
         points = camera.back_project(np.stack([u, v], -1).astype(np.float64), frame.depth_m[ring])
         plane = fit_plane(points[:: max(1, len(points) // 4000)], 0.008)
         table = table if plane is None else plane_depth(camera, *plane)
-    stands = around & (table > 0) & (table - scene.depth_m > np.maximum(0.008, 4 * stereo_sigma_m(table)))
+    stands = around & (table > 0) & (table - scene.depth_m > np.maximum(TABLE_M, 4 * stereo_sigma_m(table)))
     stands = cv2.dilate((stands | (mask & ~moved)).astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
     depth = np.where(stands | ~scene.known, table, scene.depth_m).astype(np.float32)
     return replace(scene, depth_m=depth, known=scene.known & ~stands, table_depth_m=table)
+
+
+def bare_table(scene: StaticScene) -> Bool[Array, "h w"]:
+    """Pixels whose learned scene is the table itself: no object was learned there, whatever depth now shows."""
+    table = scene.table_depth_m
+    off = np.abs(table - scene.depth_m)
+    return np.asarray(scene.known & (table > 0) & (off < np.maximum(TABLE_M, 4 * stereo_sigma_m(table))))
 
 
 def exposure_gain(frame: RgbdFrame, scene: StaticScene) -> tuple[float, float]:

@@ -11,6 +11,7 @@ from processing.segment.background.follow import BackgroundSettings, Found, _is_
 from processing.segment.background.foreground import ForegroundSettings, grown
 from processing.segment.background.late_depth import LateDepthSettings, at_color_time, way_px
 from processing.segment.background.placement import best_shift
+from processing.segment.background.segmenter import BackgroundSegmenter
 from processing.segment.background.static_scene import StaticScene
 from recordings.records import RgbdFrame
 
@@ -155,3 +156,43 @@ def picture(mine: np.ndarray, other: np.ndarray, paint: tuple[int, int, int], se
 
 def overlap(a: np.ndarray, b: np.ndarray) -> float:
     return float((a & b).sum() / (a | b).sum())
+
+
+def test_what_a_hand_cuts_in_two_stays_whole() -> None:
+    scene, settings = empty_scene(), BackgroundSettings()
+    bar, hand = np.zeros((H, W), dtype=bool), np.zeros((H, W), dtype=bool)
+    bar[60:74, 30:120], hand[20:80, 66:84] = True, True
+    mine = bar & ~hand
+    memory = remember(None, picture(mine, hand, RED, 0), Found(mine, 1.0, hand))
+    for k in range(1, 6):
+        shown, other = np.roll(mine, 3 * k, 0), np.roll(hand, 3 * k, 0)
+        seen = picture(shown, other, RED, k)
+        found = follow(seen, scene, memory, None, None, settings)
+        assert overlap(found.mask, shown) > 0.85
+        memory = remember(memory, seen, found)
+
+
+def test_a_dark_object_that_a_hand_turns_does_not_shrink_to_where_it_was_expected() -> None:
+    scene, settings, dark = empty_scene(), BackgroundSettings(), (24, 22, 26)  # a deep shadow on grey is as dark
+    body, hand = np.zeros((H, W), dtype=bool), np.zeros((H, W), dtype=bool)
+    body[50:80, 60:80], hand[50:80, 84:110] = True, True
+    memory = remember(None, picture(body, hand, dark, 0), Found(body, 1.0, hand))
+    for k in range(1, 6):  # its broad side comes into view
+        wide = body.copy()
+        wide[50:80, 60 - 3 * k : 80] = True
+        seen = picture(wide, hand, dark, k)
+        found = follow(seen, scene, memory, None, None, settings)
+        memory = remember(memory, seen, found)
+    assert overlap(found.mask, wide) > 0.9
+
+
+def test_an_object_before_the_bare_table_was_not_learned_as_scene_though_depth_misses_half_of_it() -> None:
+    mask = np.zeros((H, W), dtype=bool)
+    mask[40:70, 50:80] = True
+    half, faint = (np.s_[40:70, 50:66], (128, 120, 120), 0.7), (np.s_[40:70, 66:80], (128, 120, 120), 1.0)
+    seen, scene = frame(half, faint), empty_scene()
+    segmenter = BackgroundSegmenter(scene, None, BackgroundSettings())
+    assert segmenter._scene_without(seen, mask) is scene
+    learned = replace(scene, depth_m=np.where(mask, np.float32(0.7), scene.depth_m))  # the scene holds the object
+    segmenter = BackgroundSegmenter(learned, None, BackgroundSettings())
+    assert not segmenter._scene_without(frame((np.s_[40:70, 50:80], RED, 0.7)), mask).known[mask].any()
