@@ -158,8 +158,8 @@ def _orthonormal(matrix: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
 
 
 def fusion_floor_cm(session_path: Path, truth_path: Path, place: Path) -> float | None:
-    """Chamfer distance of what all tosses show, fused at the true poses within the true masks and with the true
-    depth scale: no estimate is in it. None where nothing can be fused."""
+    """Chamfer distance of what all tosses show, fused at the true poses within the true masks, with the true depth
+    scale and at the true times of depth: no estimate is in it. None where nothing can be fused."""
     from processing.config import Config
     from processing.field.fuse import fuse
     from processing.field.learn import TossViews, chosen_views
@@ -176,12 +176,14 @@ def fusion_floor_cm(session_path: Path, truth_path: Path, place: Path) -> float 
         mesh = None if truth is None else true_mesh(truth)
         if truth is None or mesh is None:
             return None
-        scale = float(json.loads((truth_path / "sensor_truth.json").read_text())["depth_scale"])
+        sensor = json.loads((truth_path / "sensor_truth.json").read_text())
+        late_ns = np.int64(round(1e9 * sensor["depth_delay_s"]))
         tosses = []
         for number in session.tosses:
-            frames = metric_frames(session.toss(number).rgbd("d455"), scale)
+            frames = metric_frames(session.toss(number).rgbd("d455"), float(sensor["depth_scale"]))
             track = _known(ObjectTrack.nowhere(number, run.camera.frame, frames.times_ns), truth)
-            tosses.append(TossViews(frames, frames.depth_times_ns, _masks(truth_path / f"toss_{number:02d}"), track))
+            masks = _masks(truth_path / f"toss_{number:02d}")
+            tosses.append(TossViews(frames, frames.times_ns + late_ns, masks, track))
         views = chosen_views(tosses, run.camera, run.config.shape)
         return chamfers(grid_mesh(fuse(views, run.config.shape.field.fuse)), np.eye(4), mesh).fitted.cm
     except BadInput:
