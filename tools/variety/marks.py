@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -32,7 +32,7 @@ TURNED = ("can", "bottle", "bowl")
 @dataclass(frozen=True)
 class Marks:
     """Of one session and one tracker. `add`, `adds`, `success` in percent; Chamfer in cm; `nees` a mean over six
-    degrees of freedom (1: as claimed); None where there is nothing to judge."""
+    degrees of freedom (1: as claimed); `mask_iou` a mean over frames; None where there is nothing to judge."""
 
     frames: int
     lost: int
@@ -48,6 +48,7 @@ class Marks:
     friction: float | None
     friction_inside: bool | None
     restitution: float | None
+    mask_iou: float | None = None
 
 
 def read_marks(results_path: Path, session_path: Path, truth_path: Path) -> Marks:
@@ -57,7 +58,12 @@ def read_marks(results_path: Path, session_path: Path, truth_path: Path) -> Mark
         record = results.find()
         truth = open_truth(truth_path, session, record.calibration)
         assert truth is not None
-        return _marks(results, record, truth, json.loads((truth_path / "spec.json").read_text()))
+        found = _marks(results, record, truth, json.loads((truth_path / "spec.json").read_text()))
+        tosses = results.tracks(record.name, record.scope)
+        overlaps = [
+            overlap(results.masks(record.name, record.scope, t), _masks(truth_path / f"toss_{t:02d}")) for t in tosses
+        ]
+        return replace(found, mask_iou=float(np.mean(np.concatenate(overlaps))) if overlaps else None)
     finally:
         session.close()
 
@@ -89,6 +95,12 @@ def _marks(results: Results, record: VariantRecord, truth: Truth, spec: Mapping[
         float(nees.mean() / 6) if len(nees) else None, _of(learned, "friction"), inside,
         _of(learned, "restitution"),
     )  # fmt: skip
+
+
+def overlap(found: Sequence[Bool[Array, "h w"]], true: Sequence[Bool[Array, "h w"]]) -> Float[Array, " n"]:
+    """Intersection over union of each frame's mask and its visible true pixels; frames that show none are left out."""
+    pairs = [(np.asarray(f, dtype=bool), t) for f, t in zip(found, true) if t.any()]
+    return np.array([(f & t).sum() / (f | t).sum() for f, t in pairs], dtype=np.float64)
 
 
 def _of(values: Mapping[str, Value], name: str) -> float | None:

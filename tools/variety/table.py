@@ -9,14 +9,15 @@ import numpy as np
 
 Row = Mapping[str, Any]
 HEAD = (
-    "family", "run", "sessions", "ADD", "ADD-S", "SR", "CD cm", "floor cm", "silent wrong", "flagged", "in 95 %",
-    "NEES/6",
+    "family", "run", "sessions", "ADD", "ADD-S", "SR", "CD cm", "floor cm", "mask IoU", "silent wrong", "flagged",
+    "in 95 %", "NEES/6",
     "friction est. (true)", "in interval", "restitution est. (true)", "CPU s", "worst",
 )  # fmt: skip
 MOST_NEES = 1000
 MOST_LISTED = 3
 NOTE = """ADD, ADD-S: AUC to 10 cm, SR: within 5 deg and 5 cm; means of sessions, each toss aligned at its first
 frame. CD: after rigid ICP, the one shape; floor: all tosses fused at the true poses within the true masks.
+Mask IoU: of each frame's mask and the true visible pixels, in percent.
 Silent wrong: frames called tracked that are off by more than 5 deg or 2 cm (of plain bodies of revolution:
 their axis), of all frames. Flagged: lost or interpolated. In 95 %, NEES/6: tracked frames with a
 covariance, the object frame fitted over the toss (wanted: 95, 1; NEES of the median session).
@@ -58,8 +59,8 @@ def _line(family: str, run: str, rows: Sequence[Row]) -> list[str]:
     return [
         family, run, f"{len(there)} of {len(rows)}", _mean(m, "add", 1), _mean(m, "adds", 1), _mean(m, "success", 1),
         _mean(m, "chamfer_cm", 2), _mean([r for r, _, _ in there], "floor_cm", 2),
-        f"{sum(x['silent'] for x in m)} of {frames}", f"{sum(x['flagged'] for x in m)} of {frames}",
-        _mean(m, "inside_95", 0, 100), _nees(m),
+        _mean(m, "mask_iou", 1, 100), f"{sum(x['silent'] for x in m)} of {frames}",
+        f"{sum(x['flagged'] for x in m)} of {frames}", _mean(m, "inside_95", 0, 100), _nees(m),
         _learned(there, "friction", "friction_mu"),
         f"{sum(inside)} of {len(inside)}" if inside else "-",
         _learned(there, "restitution", "restitution"), _mean([t for _, _, t in there], "cpu_s", 0),

@@ -44,6 +44,12 @@ def test_a_frame_off_by_six_degrees_or_three_centimetres_that_is_called_tracked_
     assert not marks.silent_wrong(track(near), TRUE, False).any()
 
 
+def test_a_masks_overlap_is_what_both_share_of_what_either_has_and_hidden_frames_do_not_count():
+    true, found = np.zeros((3, 8, 8), dtype=bool), np.zeros((3, 8, 8), dtype=bool)
+    true[0, 2:6, 2:6], true[1, 2:6, 2:6], found[0, 2:6, 2:4], found[2, 0, 0] = True, True, True, True
+    np.testing.assert_allclose(marks.overlap(found, true), [0.5, 0.0])
+
+
 def test_another_object_frame_is_no_error():
     frame = pose((0.3, 1.0, -2.0), (0.02, 0.0, -0.05))
     assert not marks.silent_wrong(track(TRUE @ frame), TRUE, False).any()
@@ -109,7 +115,7 @@ def row(case, add, **more):
         "frames": 40, "lost": 0, "flagged": 3, "silent": 2, "silent_tosses": 1, "add": add,
         "adds": 99.0, "success": 90.0,
         "chamfer_cm": 0.2, "inside_95": 0.9, "nees": 1.5, "friction": 0.3, "friction_inside": True,
-        "restitution": None,
+        "restitution": None, "mask_iou": 0.925,
     }  # fmt: skip
     return {
         "case": case, "seed": 1, "family": "box", "commit": "abc", "floor_cm": 0.1,
@@ -123,7 +129,7 @@ def test_the_table_means_over_sessions_sums_frames_and_names_the_worst():
     line = next(x for x in text.splitlines() if x.startswith("| all | ours"))
     cells = [c.strip() for c in line.strip("|").split("|")]
     assert cells[2:4] == ["2 of 2", "85.0"]
-    assert cells[8:10] == ["4 of 80", "6 of 80"]
+    assert cells[8:11] == ["92.5", "4 of 80", "6 of 80"]
     assert cells[-1] == "choose-009 (80.0)"
     assert "choose-000:1 choose-009:1" in text
 
