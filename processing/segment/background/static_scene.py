@@ -133,8 +133,9 @@ def learn_scene(
     depth, sigma, color, color_sigma, known, share = (np.concatenate(part) for part in zip(*rows))
     never_bare = np.zeros_like(known)
     ends = [depths[i] for i in sorted({i for pair in _ends(tosses, len(depths)) for i in pair})]
-    for end in ends:
-        never_bare |= _always_covered(end, ends, depth, share, table, settings)
+    shown = [_shows(end, depth) for end in ends]
+    for end, itself in zip(ends, shown):
+        never_bare |= _always_covered(end, itself, shown, depth, share, table, settings)
     known = ~_without_thin_lines(~known | never_bare)
     if known.mean() < settings.still_share:
         raise BadInput(
@@ -152,9 +153,15 @@ def _ends(tosses: Sequence[int] | None, count: int) -> list[tuple[int, int]]:
     return list(zip(starts.tolist(), [*(starts[1:] - 1).tolist(), count - 1]))
 
 
+def _shows(depth_m: Float32[Array, "h w"], scene_m: Float32[Array, "h w"]) -> Bool[Array, "h w"]:
+    """Pixels at which a frame shows the learned scene."""
+    return (depth_m > 0) & (np.abs(depth_m - scene_m) < np.maximum(0.006, 5 * stereo_sigma_m(scene_m)))
+
+
 def _always_covered(
     depth_m: Float32[Array, "h w"],
-    ends: Sequence[Float32[Array, "h w"]],
+    itself: Bool[Array, "h w"],
+    shown: Sequence[Bool[Array, "h w"]],
     scene_m: Float32[Array, "h w"],
     share: Float32[Array, "h w"],
     table_m: Float32[Array, "h w"],
@@ -164,16 +171,15 @@ def _always_covered(
     something else was in front of them at all other times, so what is beneath was never seen.
 
     What stands there in that frame is no part of the scene where the table was seen beneath much of it at other times;
-    the rest of it, which was not always there, isn't either: but for what stays in any other of the tosses' `ends` that
-    shows the table beneath the thing, which has left (a can that stands behind it).
+    the rest of it, which was not always there, isn't either: but for what stays once the thing has left (a can behind
+    it). `itself`, `shown`: where this frame and each end of a toss show the learned scene.
     """
     import cv2
 
     lift = np.maximum(settings.stands_m, 4 * stereo_sigma_m(table_m))
     stands = (depth_m > 0) & (table_m - depth_m > lift)
     above = (scene_m > 0) & (table_m - scene_m > lift)
-    near_m = np.maximum(0.006, 5 * stereo_sigma_m(scene_m))
-    uncertain = stands & above & (share < settings.always_share) & (np.abs(depth_m - scene_m) < near_m)
+    uncertain = stands & above & (share < settings.always_share) & itself
     out = np.zeros_like(stands)
     if not uncertain.any():
         return out
@@ -186,10 +192,7 @@ def _always_covered(
             continue
         near, far = np.quantile(depth_m[came], (0.02, 0.98))
         inside = (depth_m > near - settings.object_m) & (depth_m < far + settings.object_m)
-        stays = np.zeros_like(thing)
-        for other in ends:
-            shown = (other > 0) & (np.abs(other - scene_m) < near_m)
-            stays |= shown & (shown[came].mean() > settings.left_share)
+        stays = sum((end for end in shown if end[came].mean() > settings.left_share), np.zeros_like(thing))
         out |= thing & uncertain & inside & ~stays
     solid = cv2.morphologyEx(out.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))  # no flickering edges
     grown = cv2.dilate(solid, np.ones((5, 5), np.uint8)) > 0
