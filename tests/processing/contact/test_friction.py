@@ -4,7 +4,7 @@ import numba
 import numpy as np
 import pytest
 
-from processing.contact.friction.estimate import frames_are_slow, friction_by_forecasts
+from processing.contact.friction.estimate import best_law, frames_are_slow, friction_by_forecasts
 from processing.contact.friction.forecast import MEMBERS, Forecasts, Law, ObservedTrajectory, RigidBody
 from processing.contact.learn.prepared import prepare
 from processing.contact.learn.prior import prior_from_size
@@ -79,6 +79,24 @@ def test_forecasts_and_rollouts_call_the_kernel_with_one_signature(simulated_tos
     start = Start(*(x[None] for x in (np.eye(3), np.array([0.0, 0.0, 0.2]), np.zeros(3), np.zeros(3))))
     simulate_law(box_body, 4, Law(0.2, 0.1, 0.05), start, 2, 1 / 148)
     assert len(signatures) == 1
+
+
+class Valley(Forecasts):
+    """Scores of a toss that more friction and less restitution explain nearly as well; best at .2, .17 and .06."""
+
+    def __init__(self, slope):
+        self.slope = slope
+
+    def scores(self, laws):
+        friction, rebound, rest = np.array(
+            [[np.log(w.friction / 0.2), w.restitution - 0.17, np.log(w.unexplained / 0.06)] for w in laws]
+        ).T
+        return (10 * (friction + self.slope * rebound) ** 2 + 2 * friction**2 + 0.1 * rest**2)[:, None]
+
+
+@pytest.mark.parametrize("slope", [0, 2, 4, 6])
+def test_the_search_follows_a_valley_in_which_friction_trades_for_restitution(slope):
+    assert best_law(Valley(slope)).friction == pytest.approx(0.2, rel=0.15)
 
 
 def test_two_tosses_are_too_few(simulated_tosses, rigid_box, box_physics):
