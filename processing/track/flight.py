@@ -198,7 +198,9 @@ def flights_followed(
 ) -> list[Hypothesis]:
     """What the beam makes of the solved flights, both ways from each; those that the `known` hypothesis has already are
     left out. None where the `others` all agree with it about the flight: then nothing is left open."""
-    frames = np.flatnonzero(scene.flying) if scene.flying is not None else np.zeros(0, dtype=np.int64)
+    flown = np.flatnonzero(scene.flying) if scene.flying is not None else ()
+    # the beam makes views again once it knows the motion between the exposures: one may have nothing left to see
+    frames = np.array([i for i in flown if scene.store.usable(int(i))], dtype=np.int64)
     if len(frames) < config.least_frames:
         return []
     begin = (len(frames) - config.solved_frames) // 2

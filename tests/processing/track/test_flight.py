@@ -11,6 +11,7 @@ import pytest
 from processing.features.sift import Sift
 from processing.motion.motion_prior import MotionConfig, change_cost, gravity_in_camera
 from processing.motion.rotation_grid import ball
+from processing.sensor import view_layout as lay
 from processing.track.beam import Scene, seconds
 from processing.track.flight import FlightConfig, flights_followed, flying, solved
 from processing.track.flight_kernels import UNKNOWNS, _place
@@ -49,6 +50,21 @@ def test_no_place_in_a_ball_is_far_from_its_lattice() -> None:
     nearest = np.linalg.norm(places[:, None] - points, axis=2).min(1)
     assert nearest.max() < 0.2 * 2 / np.sqrt(3) * np.sqrt(5) / 4 + 1e-9  # the lattice's covering radius
     assert np.linalg.norm(points, axis=1).max() <= 1.0
+
+
+def test_a_view_that_shows_nothing_any_more_is_no_part_of_its_flight(scene: Scene) -> None:
+    """The beam makes views again with the motion between the exposures, and one may leave its mask."""
+    n, count = len(scene.times_s), scene.store.table[:, lay.COUNT].copy()
+    fly = replace(scene, flying=np.isin(np.arange(n), flying(scene, n, FlightConfig())))
+    nothing = started(scene.store, n, 0, first_pose(scene.store, 0))
+    scene.store.table[HELD + 4, lay.COUNT] = 0
+    try:
+        found = flights_followed(fly, 0, nothing, [], TrackConfig().beam, FlightConfig())
+    finally:
+        scene.store.table[:, lay.COUNT] = count
+    assert found
+    assert np.isfinite(found[0].poses[HELD + 5]).all()
+    assert np.isnan(found[0].poses[HELD + 4]).all()
 
 
 @pytest.mark.parametrize("t", [-0.07, 0.0, 0.1])
