@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32
 from numpy import ndarray as Array
 
-from processing.segment.background.color_model import Likeness
 from processing.segment.background.foreground import (
     ForegroundSettings,
+    around,
     fill_holes,
     grown,
     moved_pixels,
@@ -22,7 +22,8 @@ from processing.segment.background.foreground import (
     window_around,
 )
 from processing.segment.background.late_depth import LateDepthSettings, at_color_time, way_px
-from processing.segment.background.others import Others, expected_pieces, largest_other, things_near, without_others
+from processing.segment.background.memory import Found, Memory
+from processing.segment.background.others import expected_pieces, largest_other, things_near, without_others
 from processing.segment.background.placement import best_shift, shifted
 from processing.segment.background.static_scene import StaticScene
 from recordings.records import RgbdFrame
@@ -66,35 +67,6 @@ class BackgroundSettings:
 
 
 @dataclass(frozen=True, eq=False)
-class Memory:
-    """What is known when the next frame comes."""
-
-    mask: Bool[Array, "h w"]
-    velocity_px: Float[Array, "2"]
-    depth_range_m: tuple[float, float]
-    likeness: Likeness
-    size_px: float
-    """The object's size: the largest of its last masks, worth less by `SHRINKS` a frame: a bad one is small."""
-    missed: int = 0
-    others: Others | None = None
-    """What else that is not scene was near the object in the last frame: a hand, a stick."""
-    time_ns: int = 0
-    speed_px_s: Float[Array, "2"] = field(default_factory=lambda: np.zeros(2))
-    """Colour's time when the object was last found, and how fast it then moved in the image."""
-
-
-@dataclass(frozen=True, eq=False)
-class Found:
-    """The object in one frame. `largest_other_px`: the largest other thing in the picture."""
-
-    mask: Bool[Array, "h w"]
-    confidence: float
-    others: Bool[Array, "h w"] | None = None
-    """Pixels near the object that are neither scene nor robot nor the object."""
-    largest_other_px: int = 0
-
-
-@dataclass(frozen=True, eq=False)
 class RobotCues:
     """What the robot's drawing adds: log-odds of the object's colours against the robot's, and where the scene is
     unknown though no robot stands there."""
@@ -103,41 +75,10 @@ class RobotCues:
     unknown: Bool[Array, "h w"]
 
 
-def remember(memory: Memory | None, frame: RgbdFrame, found: Found, learn: bool = True) -> Memory:
-    """Memory after a frame. An empty mask leaves everything but the count of misses; colours are learned on request."""
-    mask = found.mask
-    if memory is not None and not mask.any():
-        return replace(memory, missed=memory.missed + 1)
-    others = Others.seen(frame, found.others, None if memory is None else memory.others)
-    depth = frame.depth_m[mask & (frame.depth_m > 0)]
-    low, high = (float(d) for d in np.quantile(depth, (0.02, 0.98))) if len(depth) > 10 else (0.0, 20.0)
-    if memory is None:
-        likeness = Likeness.of(frame.color_rgb, mask)
-        return Memory(mask, np.zeros(2), (low, high), likeness, float(mask.sum()), others=others, time_ns=frame.time_ns)
-    way = _center(mask) - _center(memory.mask)
-    likeness = memory.likeness.learned(frame.color_rgb, mask) if learn else memory.likeness
-    speed = way / ((frame.time_ns - memory.time_ns) * 1e-9) if frame.time_ns != memory.time_ns else np.zeros(2)
-    return Memory(
-        mask,
-        way / (memory.missed + 1),
-        (low, high),
-        likeness,
-        max(float(mask.sum()), SHRINKS * memory.size_px),
-        others=others,
-        time_ns=frame.time_ns,
-        speed_px_s=speed,
-    )
-
-
-def _center(mask: Bool[Array, "h w"]) -> Float[Array, "2"]:
-    """Centroid (x, y) in pixels."""
-    moments = cv2.moments(mask.astype(np.uint8), binaryImage=True)
-    return np.array([moments["m10"], moments["m01"]]) / max(moments["m00"], 1.0)
-
-
 MOST_REACH_PX = 150
-SHRINKS = 0.9
 MOST_ODDS = 8.0
+BAND_PX = 9
+"""Beyond this no border is drawn."""
 
 
 def reach_px(area_px: float, steps: int) -> int:
@@ -226,9 +167,8 @@ def _sought(
     came_px = _best_shift(frame, moved, near, memory, cues, reach)
     expected, own = shifted(memory.mask, came_px), moved
     if memory.others is not None and cues is None:
-        own = without_others(
-            frame, scene, moved, expected, came_px, memory.others, memory.likeness, reach, s.foreground
-        )
+        odds = memory.own_odds(frame.color_rgb, moved & around(expected | memory.others, reach))
+        own = without_others(frame, scene, moved, expected, came_px, memory.others, odds, reach, s.foreground)
     return _Sought(moved, own, expected, grown(expected, reach))
 
 
@@ -245,7 +185,7 @@ def _bordered(
     if cues is not None:  # where the scene's colour is known, the robot's colours speak against the object only
         odds = np.where(scene.known, np.minimum(cues.odds, 0), cues.odds)
         return refine_border(frame, scene, rough, odds, s.foreground, s.piece_px)
-    odds = _likeness_near(frame, memory, rough)
+    odds = memory.own_odds(frame.color_rgb, grown(rough, BAND_PX), memory.others is not None)
     odds[sought.moved & ~sought.own] = -MOST_ODDS
     return refine_border(frame, scene, rough, odds, s.foreground, None if memory.others is None else s.piece_px)
 
@@ -264,17 +204,9 @@ def _found(
     ratio = min(mask.sum(), memory.size_px) / max(mask.sum(), memory.size_px, 1)
     solid = sought.moved & sought.near & (frame.depth_m > 0)  # what only looks different may be the object's shadow
     solid &= ~(grown(rough, 3) if sought.own is sought.moved else rough)
-    others = things_near(frame, scene, solid, rough, s.foreground, s.least_px)
+    others = things_near(frame, scene, solid, rough, s.foreground, s.least_px, memory.patches)
     largest = largest_other(frame, scene, sought.moved & ~grown(mask, 9), s.foreground, s.least_px)
     return Found(mask, float(np.clip(sure * min(1.0, ratio / 0.7), 0, 1)), others, largest)
-
-
-def _likeness_near(frame: RgbdFrame, memory: Memory, region: Bool[Array, "h w"]) -> Float32[Array, "h w"]:
-    """Log-odds of the object's colours in and around a region; 0 elsewhere."""
-    out, at = np.zeros(region.shape, np.float32), window_around(region, 30)
-    if at is not None:
-        out[at] = memory.likeness.log_odds(frame.color_rgb[at], crowded=False)
-    return out
 
 
 def _best_shift(
@@ -286,11 +218,10 @@ def _best_shift(
     reach: int,
 ) -> Float[Array, "2"]:
     """How far (x, y; pixels) the object has come since it was last found: to what moved and has its colours."""
-    score, at = np.zeros(moved.shape, np.float32), window_around(near, 0)
-    if at is not None:
-        odds = memory.likeness.log_odds(frame.color_rgb[at], crowded=memory.others is not None)
-        odds = odds if cues is None else np.where(cues.odds[at] != 0, cues.odds[at], odds)
-        score[at] = moved[at] / (1 + np.exp(-odds))
+    sought = moved & around(near)
+    odds = memory.own_odds(frame.color_rgb, sought, memory.others is not None)
+    odds = odds if cues is None else np.where(cues.odds != 0, cues.odds, odds)
+    score = np.where(sought, 1 / (1 + np.exp(-odds)), 0.0).astype(np.float32)
     return best_shift(score, memory.mask, memory.velocity_px, memory.missed + 1, reach)
 
 
@@ -383,7 +314,7 @@ def _among_others(
     place = np.clip((inward - outward) / 5.0, -3.0, 1.5)
     depth, (low, high) = frame.depth_m[at], memory.depth_range_m
     elsewhere = (depth > 0) & ((depth < low - s.depth_margin_m) | (depth > high + s.depth_margin_m))
-    likeness = memory.likeness.log_odds(frame.color_rgb[at], crowded=True)
+    likeness = memory.own_odds(frame.color_rgb, around(expected, 30))[at]
     if cues is not None:
         likeness = np.minimum(likeness, np.where(cues.odds[at] != 0, cues.odds[at], likeness))
     odds = not_scene + s.foreground.weight_likeness * likeness + place - 4.0 * elsewhere

@@ -231,6 +231,14 @@ def window_around(mask: Bool[Array, "h w"], margin_px: int) -> Window | None:
     return slice(int(top), int(rows[-1]) + margin_px + 1), slice(int(left), int(columns[-1]) + margin_px + 1)
 
 
+def around(mask: Bool[Array, "h w"], margin_px: int = 0) -> Bool[Array, "h w"]:
+    """The pixels of that box."""
+    out, at = np.zeros_like(mask), window_around(mask, margin_px)
+    if at is not None:
+        out[at] = True
+    return out
+
+
 def largest_component(mask: Bool[Array, "h w"]) -> Bool[Array, "h w"]:
     """The largest 4-connected component; empty stays empty."""
     count, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=4)

@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Float32
 from numpy import ndarray as Array
 
-from processing.segment.background.color_model import MEMORY, Likeness, color_shares, shares_log_odds
 from processing.segment.background.foreground import (
     ForegroundSettings,
     grown,
     kernel,
+    nearer_than_scene,
     scene_colored,
     smooth,
     window_around,
 )
+from processing.segment.background.patches import Patches
 from processing.segment.background.placement import best_shift, shifted
 from processing.segment.background.static_scene import StaticScene, most_of_channels
 from recordings.records import RgbdFrame
@@ -29,24 +28,14 @@ MOST_PLACE = 3.0
 OWN_NATS = 1.6
 """A colour that the object shows five times as often as its surroundings is its own, also where it may be a shade of
 the scene's: a dark bottle is, of any table."""
+RIM_PX = 9
+"""Farther from the mask than this, what stands before the scene is no rim of stereo's ..."""
+THICK, NEAR_THICK = 0.03, 4
+"""... nor is what is thicker than this share of the object's size; what is near such a thick part goes with it."""
+MOST_INSIDE = 0.8
+"""Of a thing beside the object, within the object's hull."""
 DEPTH_EDGE_M = 0.02
 """A step of depth this large between neighbours cuts their pull as a strong edge of colour does."""
-
-
-@dataclass(frozen=True, eq=False)
-class Others:
-    """All other things near the object in the last frame, as one: their pixels and how often they show each colour."""
-
-    mask: Bool[Array, "h w"]
-    shares: Float[Array, " b"]
-
-    @staticmethod
-    def seen(frame: RgbdFrame, mask: Bool[Array, "h w"] | None, before: Others | None) -> Others | None:
-        """What is known of them after a frame; None where nothing stands beside the object."""
-        if mask is None or not mask.any():
-            return None
-        shares = color_shares(frame.color_rgb, mask)
-        return Others(mask, shares if before is None else MEMORY * before.shares + (1 - MEMORY) * shares)
 
 
 def things_near(
@@ -56,26 +45,51 @@ def things_near(
     mask: Bool[Array, "h w"],
     s: ForegroundSettings,
     least_px: int,
+    patches: Patches | None = None,
 ) -> Bool[Array, "h w"] | None:
-    """What of some pixels is a thing of its own, and not only the rim that a stereo camera adds to what is near: it has
-    another colour than the scene that is known there, somewhere it is wider than such a rim, and most of it lies
-    farther from the object's mask than a rim does. None where it is smaller than `least_px`."""
-    at = window_around(solid, 0)
-    if at is None or solid.sum() <= least_px:
+    """What of some pixels is a thing beside the object, with what of it looks like neither; None where there is none
+    of `least_px` pixels.
+
+    Part of it stands before the scene, farther from the mask than stereo's rim, or has another colour than the scene.
+    It is thicker than rims and shadows are, and most of it lies outside of the object's hull: within, it may be a side
+    that was never seen. `patches`: what the object looks like, where that was learned.
+    """
+    if solid.sum() <= least_px:
         return None
-    seen = (solid & scene.known)[at] & ~scene_colored(frame, scene, at, s)
-    seen = seen.astype(np.uint8)
-    wide = cv2.morphologyEx(seen, cv2.MORPH_OPEN, kernel(max(1, s.band_inside_px // 2))) > 0
-    count, labels = cv2.connectedComponents(seen, connectivity=4)
-    sizes = np.bincount(labels.ravel(), minlength=count)
-    close = np.bincount(labels[grown(mask, s.band_inside_px)[at]], minlength=count)
-    apart = np.isin(np.arange(count), labels[wide]) & (close < 0.5 * sizes)
-    kept = apart[labels] & (seen > 0)
-    if kept.sum() <= least_px:
+    others = solid if patches is None else solid & (patches.log_odds(frame.color_rgb, solid) < 0)
+    at = window_around(others, 0)
+    if at is None:
         return None
-    out = np.zeros_like(solid)
-    out[at] = kept
-    return out
+    told = np.zeros_like(others)
+    told[at] = ~scene_colored(frame, scene, at, s)
+    told |= nearer_than_scene(frame.depth_m, scene, s) & ~grown(mask, RIM_PX)
+    told = _apart(others & scene.known & told, mask, s)
+    radius = max(s.band_inside_px, round(THICK * float(np.sqrt(mask.sum()))))
+    thick = cv2.morphologyEx(others.astype(np.uint8), cv2.MORPH_OPEN, kernel(radius))
+    bodies = (cv2.dilate(thick, kernel(NEAR_THICK * radius)) > 0) & others
+    count, labels = cv2.connectedComponents(bodies.astype(np.uint8), connectivity=4)
+    sizes, inside, known = (np.bincount(labels[p], minlength=count) for p in (bodies, _hull(mask), told))
+    keep = (known > least_px) & (inside < MOST_INSIDE * sizes)
+    keep[0] = False
+    return np.asarray(keep[labels]) if keep.any() else None
+
+
+def _apart(seen: Bool[Array, "h w"], mask: Bool[Array, "h w"], s: ForegroundSettings) -> Bool[Array, "h w"]:
+    """Components that are somewhere wider than a rim and lie for the most part farther from the mask than one."""
+    wide = cv2.morphologyEx(seen.astype(np.uint8), cv2.MORPH_OPEN, kernel(max(1, s.band_inside_px // 2))) > 0
+    count, labels = cv2.connectedComponents(seen.astype(np.uint8), connectivity=4)
+    sizes, close = (np.bincount(labels[p], minlength=count) for p in (seen, grown(mask, s.band_inside_px)))
+    keep = np.isin(np.arange(count), labels[wide]) & (close < 0.5 * sizes)
+    keep[0] = False
+    return np.asarray(keep[labels])
+
+
+def _hull(mask: Bool[Array, "h w"]) -> Bool[Array, "h w"]:
+    """The pixels of a mask's convex hull."""
+    out, points = np.zeros(mask.shape, np.uint8), cv2.findNonZero(mask.astype(np.uint8))
+    if points is not None:
+        cv2.fillConvexPoly(out, cv2.convexHull(points), 1)
+    return out > 0
 
 
 def without_others(
@@ -84,29 +98,30 @@ def without_others(
     moved: Bool[Array, "h w"],
     expected: Bool[Array, "h w"],
     way_px: Float[Array, "2"],
-    others: Others,
-    likeness: Likeness,
+    others: Bool[Array, "h w"],
+    odds: Float32[Array, "h w"],
     reach_px: int,
     s: ForegroundSettings,
 ) -> Bool[Array, "h w"]:
     """The moved pixels near the object that are its own.
 
     `expected` is where the object is expected, `way_px` (x, y) how far it has come since the last frame: the others
-    came with it, or stayed where they were. Colours that only one of them showed speak for it; a border between two who
-    that look alike stays where it was. What shows the scene's colour is the object's only where that is expected.
+    came with it, or stayed where they were. `odds`: of the object, by what either looks like; a border between two that
+    look alike stays where it was. What shows the scene's colour is the object's only where that is expected, or where
+    it looks like the object by more than OWN_NATS.
     """
     out = np.zeros_like(moved)
-    at = window_around(expected | others.mask, reach_px)
+    at = window_around(expected | others, reach_px)
     if at is None:
         return out
-    odds = shares_log_odds(frame.color_rgb[at], likeness.object_shares, others.shares)
-    score = moved[at] / (1 + np.exp(odds))
-    theirs = shifted(others.mask[at], best_shift(score.astype(np.float32), others.mask[at], way_px, 1, reach_px))
+    looks, before = odds[at], others[at]
+    score = moved[at] / (1 + np.exp(looks))
+    theirs = shifted(before, best_shift(score.astype(np.float32), before, way_px, 1, reach_px))
     place = np.clip((_away(theirs) - _away(expected[at])) / PLACE_PX, -MOST_PLACE, MOST_PLACE)
-    odds = np.where(moved[at], s.weight_likeness * odds + place, 0.0).astype(np.float32)
+    votes = np.where(moved[at], s.weight_likeness * looks + place, 0.0).astype(np.float32)
     depth = np.where(frame.depth_m[at] > 0, frame.depth_m[at], np.float32(0)) * np.float32(s.edge_color / DEPTH_EDGE_M)
-    belief = smooth(odds, np.dstack([frame.color_rgb[at].astype(np.float32), depth]), s)
-    own = expected[at] | ~scene_colored(frame, scene, at, s) | (likeness.log_odds(frame.color_rgb[at]) > OWN_NATS)
+    belief = smooth(votes, np.dstack([frame.color_rgb[at].astype(np.float32), depth]), s)
+    own = expected[at] | ~scene_colored(frame, scene, at, s) | (looks > OWN_NATS)
     out[at] = moved[at] & (belief > 0) & own
     return out
 

@@ -13,17 +13,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray as Array
 
-from processing.segment.background.follow import (
-    BackgroundSettings,
-    Found,
-    Memory,
-    RobotCues,
-    component_in,
-    follow,
-    reach_px,
-    remember,
-)
+from processing.segment.background.follow import BackgroundSettings, RobotCues, component_in, follow, reach_px
 from processing.segment.background.foreground import grown, moved_pixels, refine_border
+from processing.segment.background.memory import Found, Memory, remember
 from processing.segment.background.others import things_near
 from processing.segment.background.static_scene import (
     StaticScene,

@@ -8,8 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from processing.segment.background.follow import BackgroundSettings, follow, remember
-from processing.segment.background.follow import Found as Mask
+from processing.segment.background.follow import BackgroundSettings, follow
 from processing.segment.background.foreground import (
     FATTENED_RAD,
     ForegroundSettings,
@@ -17,6 +16,8 @@ from processing.segment.background.foreground import (
     moved_pixels,
     refine_border,
 )
+from processing.segment.background.memory import Found as Mask
+from processing.segment.background.memory import remember
 from processing.segment.background.static_scene import StaticScene
 from recordings.geometry import CameraModel
 from recordings.records import RgbdFrame

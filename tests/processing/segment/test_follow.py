@@ -7,9 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from processing.segment.background.follow import BackgroundSettings, Found, _is_all_object, follow, remember
+from processing.segment.background.follow import BackgroundSettings, _is_all_object, follow
 from processing.segment.background.foreground import ForegroundSettings, grown
 from processing.segment.background.late_depth import LateDepthSettings, at_color_time, way_px
+from processing.segment.background.memory import Found, remember
+from processing.segment.background.others import things_near
+from processing.segment.background.patches import Patches
 from processing.segment.background.placement import best_shift
 from processing.segment.background.segmenter import BackgroundSegmenter
 from processing.segment.background.static_scene import StaticScene
@@ -156,6 +159,60 @@ def picture(mine: np.ndarray, other: np.ndarray, paint: tuple[int, int, int], se
 
 def overlap(a: np.ndarray, b: np.ndarray) -> float:
     return float((a & b).sum() / (a | b).sum())
+
+
+def striped(mine: np.ndarray, other: np.ndarray, seed: int) -> RgbdFrame:
+    """A striped object held by a hand that has the table's colour, which is the mean of the stripes."""
+    seen = picture(mine, other, GREY, seed)
+    color = seen.color_rgb.astype(np.float64)
+    color[other] += np.array(GREY) - np.array(SKIN)
+    rows = np.arange(H)[:, None] - int(np.flatnonzero(mine.any(1))[0])
+    color[mine] += np.where(rows // 3 % 2 == 0, 60, -60).repeat(W, 1)[mine][:, None]
+    return replace(seen, color_rgb=color.clip(0, 255).astype(np.uint8))
+
+
+def test_a_hand_of_the_tables_colour_is_told_from_the_object_by_its_contrast() -> None:
+    scene, settings = empty_scene(), BackgroundSettings()
+    held, hand = np.zeros((H, W), dtype=bool), np.zeros((H, W), dtype=bool)
+    held[50:80, 40:70], hand[20:80, 70:110] = True, True
+    memory = remember(None, striped(held, hand, 0), Found(held, 1.0, hand))
+    for k in range(1, 14):  # together, down and to the right
+        mine, other = (np.roll(m, (2 * k, 2 * k), (0, 1)) for m in (held, hand))
+        seen = striped(mine, other, k)
+        found = follow(seen, scene, memory, None, None, settings)
+        memory = remember(memory, seen, found)
+    assert overlap(found.mask, mine) > 0.9
+    assert found.others is not None
+    assert (found.others & mine).sum() < 0.05 * found.others.sum()
+
+
+def test_two_that_have_one_mean_colour_are_told_apart_by_their_contrast() -> None:
+    left, right = np.zeros((H, W), dtype=bool), np.zeros((H, W), dtype=bool)
+    left[30:90, 20:75], right[30:90, 80:140] = True, True
+    seen, moved = (striped(np.roll(left, k, 0), np.roll(right, k, 0), k) for k in (0, 7))
+    patches = Patches.of(seen.color_rgb, left, right)
+    assert patches is not None
+    odds = patches.log_odds(moved.color_rgb, np.roll(left | right, 7, 0))
+    assert (odds[np.roll(left, 7, 0)] > 0).mean() > 0.95
+    assert (odds[np.roll(right, 7, 0)] < 0).mean() > 0.95
+    assert not odds[:20].any()
+
+
+def test_a_thing_beside_the_object_is_neither_its_rim_nor_a_side_of_it_that_was_never_seen() -> None:
+    scene, s, least = empty_scene(), ForegroundSettings(), 120
+    mask = np.zeros((H, W), dtype=bool)
+    mask[40:80, 50:90] = True
+    rim, hole = grown(mask, 4) & ~mask, np.zeros((H, W), dtype=bool)
+    hole[50:70, 60:80] = True
+    hand = np.zeros((H, W), dtype=bool)
+    hand[30:70, 92:130] = True
+    seen = frame((np.s_[:, :], SKIN, 0.7))
+    assert things_near(seen, scene, rim, mask, s, least) is None
+    assert things_near(seen, scene, hole, mask & ~hole, s, least) is None
+    found = things_near(seen, scene, rim | hole | hand, mask & ~hole, s, least)
+    assert found is not None
+    assert overlap(found, hand) > 0.8
+    assert not (found & hole).any()
 
 
 def test_what_a_hand_cuts_in_two_stays_whole() -> None:

@@ -1,0 +1,118 @@
+"""Whose surface a pixel shows, the object's or a hand's, by the colours and the contrast around it.
+
+A colour alone does not tell: a hand has shades that a striped box has too. What either looks like at three scales is
+learned by a random forest (Breiman 2001) from the frame in which the object is known best, which is never forgotten.
+Trained on the first frame alone it tells 96 to 99 % of the pixels of wild sessions right 27 frames later, while the
+object is held; histograms of colours tell 85 to 91 %.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float32, Int32, UInt8
+from numpy import ndarray as Array
+
+from processing.segment.background.foreground import grown, kernel, window_around
+
+SCALES, LEAST_PX = (0.01, 0.025, 0.06), 0.7
+"""Of the blurs, as shares of the object's size in the image, and no less than this."""
+REACH = 4
+"""Standard deviations of a blur beyond which nothing counts."""
+SAMPLES, LEAST_SAMPLES = 1500, 100
+"""Pixels of either that are learned from a frame, and how many it must show."""
+RECENT, EVERY = 4, 4
+"""So many later frames are remembered beside the first; every so many frames one is learned."""
+TREES, DEPTH, LEAF = 40, 10, 10
+MOST = 3.0
+"""Log-odds of a pixel that all trees agree about."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Samples:
+    """Features and classes (1: the object's) of pixels of one frame."""
+
+    features: Float32[Array, "n f"]
+    classes: Int32[Array, " n"]
+
+
+@dataclass(frozen=True, eq=False)
+class Patches:
+    """What was learned, the first frame first; `age`: frames since. `forest`: OpenCV's `RTrees`."""
+
+    samples: tuple[_Samples, ...]
+    size_px: float
+    forest: Any
+    age: int = 0
+
+    @staticmethod
+    def of(color_rgb: UInt8[Array, "h w 3"], mask: Bool[Array, "h w"], others: Bool[Array, "h w"]) -> Patches | None:
+        """From one frame; None where it shows too little of either."""
+        size = float(np.sqrt(mask.sum()))
+        samples = _samples(color_rgb, mask, others, size)
+        return None if samples is None else Patches((samples,), size, _trained((samples,)))
+
+    def after(self, color_rgb: UInt8[Array, "h w 3"], mask: Bool[Array, "h w"], others: Bool[Array, "h w"]) -> Patches:
+        """After one more frame that shows both."""
+        if self.age + 1 < EVERY:
+            return replace(self, age=self.age + 1)
+        samples = _samples(color_rgb, mask, others, self.size_px)
+        if samples is None:
+            return self
+        kept = (self.samples[0], *self.samples[1:][-(RECENT - 1) :], samples)
+        return Patches(kept, self.size_px, _trained(kept))
+
+    def log_odds(self, color_rgb: UInt8[Array, "h w 3"], where: Bool[Array, "h w"]) -> Float32[Array, "h w"]:
+        """log(P(object) / P(others)) of the pixels of a mask, within +-MOST; 0 elsewhere."""
+        out, at = np.zeros(where.shape, np.float32), window_around(where, _margin(self.size_px))
+        if at is None:
+            return out
+        votes = self.forest.getVotes(_features(color_rgb[at], self.size_px)[where[at]], 0)[1:].astype(np.float32)
+        share, rest = votes[:, 1] / votes.sum(1), np.float32(1 / (1 + np.exp(MOST)))
+        out[where] = np.log((share + rest) / (1 - share + rest))
+        return out
+
+
+def _margin(size_px: float) -> int:
+    """How far around a pixel its features reach."""
+    return int(np.ceil(REACH * SCALES[-1] * size_px)) + 1
+
+
+def _features(color_rgb: UInt8[Array, "h w 3"], size_px: float) -> Float32[Array, "h w f"]:
+    """L*a*b* blurred at each scale, and the contrast of L* there."""
+    lab, found = cv2.cvtColor(color_rgb, cv2.COLOR_RGB2LAB).astype(np.float32), []
+    for share in SCALES:
+        sigma = max(share * size_px, LEAST_PX)
+        mean = cv2.GaussianBlur(lab, (0, 0), sigma)
+        square = cv2.GaussianBlur(lab[..., 0] ** 2, (0, 0), sigma)
+        found += [mean, np.sqrt(np.maximum(square - mean[..., 0] ** 2, 0))[..., None]]
+    return np.concatenate(found, -1)
+
+
+def _samples(
+    color_rgb: UInt8[Array, "h w 3"], mask: Bool[Array, "h w"], others: Bool[Array, "h w"], size_px: float
+) -> _Samples | None:
+    """Of the mask's core, and of what lies beside it, as many: drawn with replacement."""
+    at = window_around(mask | others, _margin(size_px))
+    core, beside = cv2.erode(mask.astype(np.uint8), kernel(1)) > 0, others & ~grown(mask, 2)
+    if at is None or min(core.sum(), beside.sum()) < LEAST_SAMPLES:
+        return None
+    features, rng = _features(color_rgb[at], size_px), np.random.default_rng(0)
+    chosen = [part[rng.integers(len(part), size=SAMPLES)] for part in (features[core[at]], features[beside[at]])]
+    return _Samples(np.concatenate(chosen), np.repeat(np.array([1, 0], np.int32), SAMPLES))
+
+
+def _trained(samples: tuple[_Samples, ...]) -> Any:
+    """A forest in which the first frame counts as much as all later ones."""
+    counted = samples[:1] * max(len(samples) - 1, 1) + samples[1:]
+    features, classes = (np.concatenate([getattr(s, name) for s in counted]) for name in ("features", "classes"))
+    forest = cv2.ml.RTrees.create()
+    forest.setMaxDepth(DEPTH)
+    forest.setMinSampleCount(LEAF)
+    forest.setActiveVarCount(round(features.shape[1] ** 0.5))
+    forest.setTermCriteria((cv2.TERM_CRITERIA_MAX_ITER, TREES, 0.0))
+    forest.train(features, cv2.ml.ROW_SAMPLE, classes)
+    return forest
