@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int64
 from numpy import ndarray as Array
+from scipy.special import expit
 
 from processing.segment.background.foreground import (
     ForegroundSettings,
@@ -40,8 +41,10 @@ class DepthDelaySettings:
 
     least_s: float = 0.002
     """A smaller delay moves nothing by more than depth's own noise."""
-    sigmas: float = 4.0
-    """A delay that is not so many standard deviations from nothing is chance."""
+    right: float = 0.5
+    """Of all recordings, those whose stamps are right; of the others, stamps are off by ..."""
+    off_s: float = 0.01
+    """... this much (standard deviation): up to half a frame's interval at 30 Hz."""
     longest_s: float = 0.033
     """Depth later than a frame's interval belongs to another frame."""
     least_frames: int = 6
@@ -122,7 +125,7 @@ def _chosen(speed_px_s: Float[Array, " n"], s: DepthDelaySettings) -> list[int]:
 
 def delay_of(seen: OutlineShifts, s: DepthDelaySettings) -> DepthDelay | None:
     """The delay that all frames together tell; None where too few move. One that may be chance is told as it is: see
-    `significant_delay`."""
+    `believed_delay`."""
     moving = int((np.linalg.norm(seen.speed_px_s, axis=1) > s.moving_px_s).sum())
     if moving < s.least_frames:
         return None
@@ -141,13 +144,17 @@ def delay_of(seen: OutlineShifts, s: DepthDelaySettings) -> DepthDelay | None:
     return DepthDelay(float(fit[2]), float(sigma * np.sqrt(np.linalg.pinv(information)[2, 2])), moving)
 
 
-def significant_delay(found: DepthDelay | None, stamped_s: float, s: DepthDelaySettings) -> float:
-    """What (seconds) is added to depth's stamps, which have it exposed `stamped_s` after colour: nothing where they
-    differ from the images by little, by chance, or by more than can be."""
+def believed_delay(found: DepthDelay | None, stamped_s: float, s: DepthDelaySettings) -> float:
+    """What (seconds) is added to depth's stamps, which have it exposed `stamped_s` after colour: the mean of the
+    posterior between stamps that are right and stamps that are off by any amount (a spike and a slab: Mitchell and
+    Beauchamp 1988). Nothing where that is little, or where the images tell more than can be."""
     if found is None or abs(found.delay_s) > s.longest_s:
         return 0.0
-    more_s = found.delay_s - stamped_s
-    return more_s if abs(more_s) > max(s.least_s, s.sigmas * found.sigma_s) else 0.0
+    more_s, chance = found.delay_s - stamped_s, max(found.sigma_s, 1e-6) ** 2
+    kept = s.off_s**2 / (s.off_s**2 + chance)
+    log_odds = 0.5 * (np.log1p(-kept) + kept * more_s**2 / chance) + np.log((1 - s.right) / s.right)
+    believed_s = more_s * kept * float(expit(log_odds))
+    return believed_s if abs(believed_s) > s.least_s else 0.0
 
 
 def _center(mask: Bool[Array, "h w"]) -> Float[Array, "2"]:

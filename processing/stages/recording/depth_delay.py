@@ -11,14 +11,14 @@ import numpy as np
 
 from processing.engine.parts import side_by_side
 from processing.run import CAMERA, Run
-from processing.segment.background.depth_delay import OutlineShifts, delay_of, outline_shifts, significant_delay
+from processing.segment.background.depth_delay import OutlineShifts, believed_delay, delay_of, outline_shifts
 from processing.segment.background.static_scene import StaticScene
 from processing.sensor.depth_stamps import with_depth_later
 from processing.store import Done
 from recordings.notices import Notice
 from recordings.results.folder import read_masks
 
-VERSION = 1
+VERSION = 2
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ def with_depth_in_time(run: Run, scene: Done, masks: Mapping[int, Done]) -> Run:
         stamps_s = [(f.depth_times_ns - f.times_ns) * 1e-9 for f in frames.values()]
         stamped_s = float(np.median(np.concatenate(stamps_s)))
         found = delay_of(OutlineShifts.joined(seen), settings)
-        added_s = significant_delay(found, stamped_s, settings)
+        added_s = believed_delay(found, stamped_s, settings)
         if found is None:
             return DepthDelayResult(stamped_s, None, None, added_s, 0)
         return DepthDelayResult(stamped_s, found.delay_s, found.sigma_s, added_s, found.frames)
@@ -68,6 +68,6 @@ def _late_depth(result: DepthDelayResult) -> Notice:
     seen = (
         f"depth shows the moving object {1e3 * abs(result.seen_s):.1f} +- {1e3 * result.sigma_s:.1f} ms "
         f"{'after' if result.seen_s > 0 else 'before'} colour, its stamps say {1e3 * result.stamped_s:.1f} ms: depth's "
-        "times were put right"
+        f"times were put right by {1e3 * result.added_s:.1f} ms"
     )
     return Notice("rig", "low", seen, "record depth's own stamps, or the exposure of both", "likely")
