@@ -21,7 +21,7 @@ from recordings.results.folder import read_shape, read_track, write_track
 from recordings.results.track_notes import write_notes
 from recordings.tracks import ObjectTrack
 
-VERSION = 18
+VERSION = 19
 
 
 @dataclass(frozen=True)

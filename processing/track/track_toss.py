@@ -276,9 +276,9 @@ def _first_center_m(store: ViewStore, view: int, known: _Known) -> Float[Array, 
 def _followed(
     scene: Scene, first: int, known: _Known, config: TrackConfig, progress: Progress
 ) -> tuple[list[Hypothesis], float, dict[int, list[Candidate]]]:
-    """Hypotheses of the same frames: the beam forward, then once more backward with all that forward learned as the
-    model; a beam backward that knows nothing of the first but where the last frame is; and the beam forward itself,
-    where both backward ones differ from it. Where they leave its flight open, that solved as one adds its own."""
+    """Hypotheses of the same frames: the beam forward, then once more backward to the first frame with all that forward
+    learned as the model; a beam backward that knows nothing of that but where the last frame is; and the beam forward
+    itself, where both differ from it. Where they leave its flight open, that solved as one adds its own."""
     n = len(scene.times_s)
 
     def report(i: int, beam: list[Hypothesis]) -> None:
@@ -289,14 +289,14 @@ def _followed(
     best = ahead.best
     last = best.tracked[-1]
     all_done = replace(best, done=(last,), total=0.0)
-    stop = first if known.model is None or known.start is not None else first - 1
-    narrow = replace(config.beam, width=2)
-    hypotheses = [follow(scene, np.arange(last - 1, stop, -1), [all_done], narrow).best]
+    stop = first if known.model is not None and known.start is not None else first - 1
+    narrow, starts = replace(config.beam, width=2), [all_done]
     if known.model is None and last > first + 1:
-        fresh = started(scene.store, n, last, best.poses[last])
-        hypotheses.append(
-            anchored_to(follow(scene, np.arange(last - 1, first - 1, -1), [fresh], narrow).best, best, first)
-        )
+        starts.append(started(scene.store, n, last, best.poses[last]))
+    hypotheses = [follow(scene, np.arange(last - 1, stop, -1), [h], narrow).best for h in starts]
+    if known.model is None:
+        hypotheses = [anchored_to(h, best, first) for h in hypotheses]
+    if len(starts) > 1:
         if all(apart_deg(best.poses[:n], s.poses[:n]) > config.separate_deg for s in hypotheses):
             hypotheses.append(best)
         hypotheses += _through_flights(scene, first, best, hypotheses, narrow, config)

@@ -12,10 +12,10 @@ from processing.features.sift import Sift
 from processing.motion.motion_prior import MotionConfig, change_cost, gravity_in_camera
 from processing.motion.rotation_grid import ball
 from processing.sensor import view_layout as lay
-from processing.track.beam import Scene, seconds
+from processing.track.beam import Followed, Hypothesis, Scene, seconds
 from processing.track.flight import FlightConfig, flights_followed, flying, solved
 from processing.track.flight_kernels import UNKNOWNS, _place
-from processing.track.track_toss import TrackConfig, first_pose, started, views_of
+from processing.track.track_toss import TrackConfig, _followed, _Known, first_pose, started, views_of
 from recordings.geometry import Transform, rotation_exp, rotation_log
 from recordings.progress import Silent
 
@@ -125,3 +125,21 @@ def test_in_flight_a_change_of_spin_costs_more_the_greater_it_is_and_an_impact_m
     assert cost(20.0, False) < MotionConfig().impact_cost
     assert cost(20.0, True) > 4 * cost(20.0, False)
     assert cost(24.0, True) == pytest.approx(4 * cost(12.0, True))
+
+
+def test_where_the_way_back_slid_away_the_first_frame_goes_with_it(scene: Scene, monkeypatch: Any) -> None:
+    """Left where it was, it would lie as no pair of views says, and all poses are judged from it."""
+    n, slid = len(scene.times_s), Transform("a", "b", rotation_exp(np.array([0.0, 0.0, 2.0])), np.zeros(3)).matrix
+    true = np.array([thrown(i).matrix for i in range(n)])
+
+    def followed(_: Scene, order: Any, beam: list[Hypothesis], *unused: Any) -> Followed:
+        poses = beam[0].poses.copy()
+        poses[order] = true[order] if order[0] < order[-1] else true[order] @ slid
+        return Followed(replace(beam[0], poses=poses, done=(*beam[0].done, *map(int, order))), 0.0, {})
+
+    monkeypatch.setattr("processing.track.track_toss.follow", followed)
+    known = _Known(true[0], 0, None, None)
+    for hypothesis in _followed(scene, 0, known, TrackConfig(), Silent())[0]:
+        np.testing.assert_allclose(hypothesis.poses[0], true[0])
+        steps, right = (p[1:] @ np.linalg.inv(p[:-1]) for p in (hypothesis.poses, true))
+        np.testing.assert_allclose(steps[:-1], right[:-1], atol=1e-9)  # at the last frame the slide begins
