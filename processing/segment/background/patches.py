@@ -22,11 +22,12 @@ SCALES, LEAST_PX = (0.01, 0.025, 0.06), 0.7
 """Of the blurs, as shares of the object's size in the image, and no less than this."""
 REACH = 4
 """Standard deviations of a blur beyond which nothing counts."""
-SAMPLES, LEAST_SAMPLES = 1500, 100
+SAMPLES, LEAST_SAMPLES = 300, 100
 """Pixels of either that are learned from a frame, and how many it must show."""
-RECENT, EVERY = 4, 4
-"""So many later frames are remembered beside the first; every so many frames one is learned."""
-TREES, DEPTH, LEAF = 40, 10, 10
+RECENT, EVERY = 4, 5
+"""So many later frames are remembered beside the first, which counts as much as all of them; every so many frames one
+is learned."""
+TREES, DEPTH, LEAF = 25, 10, 10
 MOST = 3.0
 """Log-odds of a pixel that all trees agree about."""
 
@@ -52,14 +53,14 @@ class Patches:
     def of(color_rgb: UInt8[Array, "h w 3"], mask: Bool[Array, "h w"], others: Bool[Array, "h w"]) -> Patches | None:
         """From one frame; None where it shows too little of either."""
         size = float(np.sqrt(mask.sum()))
-        samples = _samples(color_rgb, mask, others, size)
+        samples = _samples(color_rgb, mask, others, size, RECENT * SAMPLES)
         return None if samples is None else Patches((samples,), size, _trained((samples,)))
 
     def after(self, color_rgb: UInt8[Array, "h w 3"], mask: Bool[Array, "h w"], others: Bool[Array, "h w"]) -> Patches:
         """After one more frame that shows both."""
         if self.age + 1 < EVERY:
             return replace(self, age=self.age + 1)
-        samples = _samples(color_rgb, mask, others, self.size_px)
+        samples = _samples(color_rgb, mask, others, self.size_px, SAMPLES)
         if samples is None:
             return self
         kept = (self.samples[0], *self.samples[1:][-(RECENT - 1) :], samples)
@@ -93,22 +94,20 @@ def _features(color_rgb: UInt8[Array, "h w 3"], size_px: float) -> Float32[Array
 
 
 def _samples(
-    color_rgb: UInt8[Array, "h w 3"], mask: Bool[Array, "h w"], others: Bool[Array, "h w"], size_px: float
+    color_rgb: UInt8[Array, "h w 3"], mask: Bool[Array, "h w"], others: Bool[Array, "h w"], size_px: float, count: int
 ) -> _Samples | None:
-    """Of the mask's core, and of what lies beside it, as many: drawn with replacement."""
+    """`count` pixels of the mask's core and as many of what lies beside it, drawn with replacement."""
     at = window_around(mask | others, _margin(size_px))
     core, beside = cv2.erode(mask.astype(np.uint8), kernel(1)) > 0, others & ~grown(mask, 2)
     if at is None or min(core.sum(), beside.sum()) < LEAST_SAMPLES:
         return None
     features, rng = _features(color_rgb[at], size_px), np.random.default_rng(0)
-    chosen = [part[rng.integers(len(part), size=SAMPLES)] for part in (features[core[at]], features[beside[at]])]
-    return _Samples(np.concatenate(chosen), np.repeat(np.array([1, 0], np.int32), SAMPLES))
+    chosen = [part[rng.integers(len(part), size=count)] for part in (features[core[at]], features[beside[at]])]
+    return _Samples(np.concatenate(chosen), np.repeat(np.array([1, 0], np.int32), count))
 
 
 def _trained(samples: tuple[_Samples, ...]) -> Any:
-    """A forest in which the first frame counts as much as all later ones."""
-    counted = samples[:1] * max(len(samples) - 1, 1) + samples[1:]
-    features, classes = (np.concatenate([getattr(s, name) for s in counted]) for name in ("features", "classes"))
+    features, classes = (np.concatenate([getattr(s, name) for s in samples]) for name in ("features", "classes"))
     forest = cv2.ml.RTrees.create()
     forest.setMaxDepth(DEPTH)
     forest.setMinSampleCount(LEAF)
