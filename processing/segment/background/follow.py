@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Bool, Float32
 from numpy import ndarray as Array
 
 from processing.segment.background.foreground import (
@@ -164,10 +164,13 @@ def _sought(
         moved &= scene.known | (memory.likeness.log_odds(frame.color_rgb) > 0)
     if block is not None:
         moved &= ~block
-    came_px = _best_shift(frame, moved, near, memory, cues, reach)
+    looked = moved & around(near)
+    odds = memory.own_odds(frame.color_rgb, looked, memory.others is not None)
+    told = odds if cues is None else np.where(cues.odds != 0, cues.odds, odds)
+    score = np.where(looked, 1 / (1 + np.exp(-told)), 0.0).astype(np.float32)
+    came_px = best_shift(score, memory.mask, memory.velocity_px, memory.missed + 1, reach)
     expected, own = shifted(memory.mask, came_px), moved
     if memory.others is not None and cues is None:
-        odds = memory.own_odds(frame.color_rgb, moved & around(expected | memory.others, reach))
         own = without_others(frame, scene, moved, expected, came_px, memory.others, odds, reach, s.foreground)
     return _Sought(moved, own, expected, grown(expected, reach))
 
@@ -207,22 +210,6 @@ def _found(
     others = things_near(frame, scene, solid, rough, s.foreground, s.least_px, memory.patches)
     largest = largest_other(frame, scene, sought.moved & ~grown(mask, 9), s.foreground, s.least_px)
     return Found(mask, float(np.clip(sure * min(1.0, ratio / 0.7), 0, 1)), others, largest)
-
-
-def _best_shift(
-    frame: RgbdFrame,
-    moved: Bool[Array, "h w"],
-    near: Bool[Array, "h w"],
-    memory: Memory,
-    cues: RobotCues | None,
-    reach: int,
-) -> Float[Array, "2"]:
-    """How far (x, y; pixels) the object has come since it was last found: to what moved and has its colours."""
-    sought = moved & around(near)
-    odds = memory.own_odds(frame.color_rgb, sought, memory.others is not None)
-    odds = odds if cues is None else np.where(cues.odds != 0, cues.odds, odds)
-    score = np.where(sought, 1 / (1 + np.exp(-odds)), 0.0).astype(np.float32)
-    return best_shift(score, memory.mask, memory.velocity_px, memory.missed + 1, reach)
 
 
 def _moved_by_depth(
