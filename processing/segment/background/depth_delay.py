@@ -41,8 +41,10 @@ class DepthDelaySettings:
 
     least_s: float = 0.002
     """A smaller delay moves nothing by more than depth's own noise."""
-    right: float = 0.5
-    """Of all recordings, those whose stamps are right; of the others, stamps are off by ..."""
+    right: float = 0.95
+    right_if_same: float = 0.5
+    """Of all recordings, those whose stamps are right: most where depth has stamps of its own, half of those where they
+    are colour's, which often only says that nobody measured. In the others stamps are off by ..."""
     off_s: float = 0.01
     """... this much (standard deviation): up to half a frame's interval at 30 Hz."""
     longest_s: float = 0.033
@@ -152,7 +154,8 @@ def believed_delay(found: DepthDelay | None, stamped_s: float, s: DepthDelaySett
         return 0.0
     more_s, chance = found.delay_s - stamped_s, max(found.sigma_s, 1e-6) ** 2
     kept = s.off_s**2 / (s.off_s**2 + chance)
-    log_odds = 0.5 * (np.log1p(-kept) + kept * more_s**2 / chance) + np.log((1 - s.right) / s.right)
+    right = s.right if stamped_s != 0 else s.right_if_same
+    log_odds = 0.5 * (np.log1p(-kept) + kept * more_s**2 / chance) + np.log((1 - right) / right)
     believed_s = more_s * kept * float(expit(log_odds))
     return believed_s if abs(believed_s) > s.least_s else 0.0
 

@@ -18,7 +18,7 @@ from processing.store import Done
 from recordings.notices import Notice
 from recordings.results.folder import read_masks
 
-VERSION = 2
+VERSION = 3
 
 
 @dataclass(frozen=True)

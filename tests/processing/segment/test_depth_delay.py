@@ -109,6 +109,9 @@ def test_a_delay_is_believed_the_more_the_surer_it_is_and_only_beyond_what_the_s
     assert 0.007 < likely < sure
     assert 0.0 <= hardly < likely
     assert believed_delay(DepthDelay(0.004, 0.004, 20), 0.0, SETTINGS) == 0.0  # as likely chance
+    own = believed_delay(DepthDelay(0.0096, 0.0017, 20), 0.0137, SETTINGS)  # depth has stamps of its own
+    assert own == 0.0
+    assert believed_delay(DepthDelay(0.0041, 0.0017, 20), 0.0, SETTINGS) > 0.002
 
 
 def test_what_is_believed_is_nearer_to_the_truth_on_average_than_what_is_measured_or_nothing() -> None:
