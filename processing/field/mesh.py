@@ -16,7 +16,7 @@ from recordings.tracks import ObjectShape
 
 
 def extract_mesh(field: ObjectField, grid: Grid, object_frame: str = "object", source: str = "field") -> ObjectShape:
-    """Marching cubes at zero on the warm start's grid, largest solid component, colours from the field.
+    """Marching cubes at zero on the warm start's grid, without small pieces beside it, colours from the field.
 
     Raises BadInput when the field has no surface.
     """
@@ -33,14 +33,16 @@ def grid_mesh(grid: Grid, object_frame: str = "object", source: str = "fused") -
 
 
 def surface_of(sdf_m: Float32[Array, "a b c"], grid: Grid) -> tuple[Float[Array, "v 3"], Array]:
-    """Vertices in metres and outward-facing triangles of the largest solid; a border of empty cells closes it."""
+    """Vertices in metres and outward-facing triangles of the largest solid, and of others nearly as large: a hand may
+    hide what joins them. A border of empty cells closes them."""
     solid, count = ndimage.label(sdf_m < 0)
     if count == 0:
         raise BadInput("the field has no inside, so no surface: the views see too little of the object")
-    largest = int(np.argmax(ndimage.sum_labels(sdf_m < 0, solid, range(1, count + 1)))) + 1
-    near_largest = ndimage.binary_dilation(solid == largest)
-    cleaned = np.where((sdf_m < 0) & (solid != largest), grid.voxel_m, sdf_m)
-    cleaned = np.where(near_largest, cleaned, np.maximum(cleaned, 0.1 * grid.voxel_m))
+    sizes = np.bincount(solid.ravel(), minlength=count + 1)
+    sizes[0] = 0
+    kept = (sizes >= PIECE_SHARE * sizes.max())[solid]
+    cleaned = np.where((sdf_m < 0) & ~kept, grid.voxel_m, sdf_m)
+    cleaned = np.where(ndimage.binary_dilation(kept), cleaned, np.maximum(cleaned, 0.1 * grid.voxel_m))
     cleaned = _fill_cavities(cleaned, grid.voxel_m)
     least = np.float32(LEAST_SHARE * grid.voxel_m)
     cleaned = np.where(np.abs(cleaned) < least, np.where(cleaned < 0, -least, least), cleaned)
@@ -49,6 +51,8 @@ def surface_of(sdf_m: Float32[Array, "a b c"], grid: Grid) -> tuple[Float[Array,
     return grid.points(vertices.astype(np.float64) - 1), faces.astype(np.int64)
 
 
+PIECE_SHARE = 0.25
+"""Of the largest solid's volume: a smaller one beside it is no part of the object but what masks let through."""
 LEAST_SHARE = 1e-3
 """Of a cell's edge: a surface nearer to a cell's corner is moved away that far, because triangles that meet in the
 corner would have no area."""

@@ -7,10 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+import trimesh
 from scipy.spatial.transform import Rotation
 
 from processing.field.fuse import FuseConfig, fuse
-from processing.field.mesh import extract_mesh, grid_mesh
+from processing.field.mesh import extract_mesh, grid_mesh, surface_of
 from processing.field.train import FieldConfig, train_field
 from processing.field.views import FieldView, make_view, object_points
 from processing.motion.interpolate import pose_at
@@ -245,3 +246,15 @@ def test_the_pose_at_depths_exposure_lies_on_the_parabola():
     np.testing.assert_allclose(found[:3, :3], Rotation.from_rotvec([0, 5 * t, 0]).as_matrix(), atol=1e-6)
     before = pose_at(track, 0, int(times_ns[0]) + 16_000_000)
     assert abs(before[1, 3] - (-1.2 * 0.016 + 0.5 * 9.81 * 0.016**2)) < 0.0015
+
+
+def test_pieces_that_a_hand_cuts_apart_are_all_kept_and_crumbs_are_not() -> None:
+    grid = fuse(cube_views(8), FuseConfig(truncation_m=0.005))
+    sdf = np.full_like(grid.sdf_m, grid.voxel_m)
+    for start, edge in ((2, 8), (14, 6), (24, 3)):
+        sdf[start : start + edge, 2 : 2 + edge, 2 : 2 + edge] = -grid.voxel_m
+    vertices_m, faces = surface_of(sdf, replace(grid, sdf_m=sdf))
+    bodies = trimesh.Trimesh(vertices_m, faces).split()
+    sizes = sorted(float(np.ptp(b.vertices, axis=0).mean()) / grid.voxel_m for b in bodies)
+    assert sizes == pytest.approx([6, 8], abs=0.01)
+    assert all(b.is_watertight for b in bodies)
