@@ -127,7 +127,7 @@ def _chosen(speed_px_s: Float[Array, " n"], s: DepthDelaySettings) -> list[int]:
 
 def delay_of(seen: OutlineShifts, s: DepthDelaySettings) -> DepthDelay | None:
     """The delay that all frames together tell; None where too few move. One that may be chance is told as it is: see
-    `believed_delay`."""
+    `posterior_delay`."""
     moving = int((np.linalg.norm(seen.speed_px_s, axis=1) > s.moving_px_s).sum())
     if moving < s.least_frames:
         return None
@@ -146,7 +146,7 @@ def delay_of(seen: OutlineShifts, s: DepthDelaySettings) -> DepthDelay | None:
     return DepthDelay(float(fit[2]), float(sigma * np.sqrt(np.linalg.pinv(information)[2, 2])), moving)
 
 
-def believed_delay(found: DepthDelay | None, stamped_s: float, s: DepthDelaySettings) -> float:
+def posterior_delay(found: DepthDelay | None, stamped_s: float, s: DepthDelaySettings) -> float:
     """What (seconds) is added to depth's stamps, which have it exposed `stamped_s` after colour: the mean of the
     posterior between stamps that are right and stamps that are off by any amount (a spike and a slab: Mitchell and
     Beauchamp 1988). Nothing where that is little, or where the images tell more than can be."""
@@ -156,8 +156,8 @@ def believed_delay(found: DepthDelay | None, stamped_s: float, s: DepthDelaySett
     kept = s.off_s**2 / (s.off_s**2 + chance)
     right = s.right if stamped_s != 0 else s.right_if_same
     log_odds = 0.5 * (np.log1p(-kept) + kept * more_s**2 / chance) + np.log((1 - right) / right)
-    believed_s = more_s * kept * float(expit(log_odds))
-    return believed_s if abs(believed_s) > s.least_s else 0.0
+    added_s = more_s * kept * float(expit(log_odds))
+    return added_s if abs(added_s) > s.least_s else 0.0
 
 
 def _center(mask: Bool[Array, "h w"]) -> Float[Array, "2"]:

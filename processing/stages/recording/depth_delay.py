@@ -11,7 +11,7 @@ import numpy as np
 
 from processing.engine.parts import side_by_side
 from processing.run import CAMERA, Run
-from processing.segment.background.depth_delay import OutlineShifts, believed_delay, delay_of, outline_shifts
+from processing.segment.background.depth_delay import OutlineShifts, delay_of, outline_shifts, posterior_delay
 from processing.segment.background.static_scene import StaticScene
 from processing.sensor.depth_stamps import with_depth_later
 from processing.store import Done
@@ -47,7 +47,7 @@ def with_depth_in_time(run: Run, scene: Done, masks: Mapping[int, Done]) -> Run:
         stamps_s = [(f.depth_times_ns - f.times_ns) * 1e-9 for f in frames.values()]
         stamped_s = float(np.median(np.concatenate(stamps_s)))
         found = delay_of(OutlineShifts.joined(seen), settings)
-        added_s = believed_delay(found, stamped_s, settings)
+        added_s = posterior_delay(found, stamped_s, settings)
         if found is None:
             return DepthDelayResult(stamped_s, None, None, added_s, 0)
         return DepthDelayResult(stamped_s, found.delay_s, found.sigma_s, added_s, found.frames)

@@ -18,9 +18,9 @@ from processing.segment.background.depth_delay import (
     DepthDelay,
     DepthDelaySettings,
     OutlineShifts,
-    believed_delay,
     delay_of,
     outline_shifts,
+    posterior_delay,
 )
 from processing.segment.background.static_scene import StaticScene
 from processing.sensor.depth_stamps import with_depth_later
@@ -81,7 +81,7 @@ def test_an_offset_that_is_there_at_rest_is_no_delay() -> None:
     assert found is not None
     assert found.delay_s == pytest.approx(0.012, abs=3 * found.sigma_s)
     still = delay_of(OutlineShifts(np.array([1.5, -0.7]) + noise, speed), SETTINGS)
-    assert believed_delay(still, 0.0, SETTINGS) == 0.0
+    assert posterior_delay(still, 0.0, SETTINGS) == 0.0
 
 
 def test_frames_in_which_colour_was_mistaken_do_not_pull() -> None:
@@ -96,22 +96,22 @@ def test_frames_in_which_colour_was_mistaken_do_not_pull() -> None:
 def test_what_hardly_moves_tells_nothing() -> None:
     speed = np.full((30, 2), 20.0)
     assert delay_of(OutlineShifts(-0.01 * speed, speed), SETTINGS) is None
-    assert believed_delay(None, 0.0, SETTINGS) == 0.0
+    assert posterior_delay(None, 0.0, SETTINGS) == 0.0
 
 
 def test_a_delay_is_believed_the_more_the_surer_it_is_and_only_beyond_what_the_stamps_say() -> None:
-    assert believed_delay(DepthDelay(0.012, 0.0005, 20), 0.0, SETTINGS) == pytest.approx(0.012, rel=5e-3)
-    assert believed_delay(DepthDelay(0.012, 0.0005, 20), 0.009, SETTINGS) == pytest.approx(0.003, rel=5e-3)
-    assert believed_delay(DepthDelay(0.012, 0.0005, 20), 0.0115, SETTINGS) == 0.0
-    assert believed_delay(DepthDelay(0.05, 0.0005, 20), 0.0, SETTINGS) == 0.0
-    sure, likely, hardly = (believed_delay(DepthDelay(0.012, x, 20), 0.0, SETTINGS) for x in (0.003, 0.0045, 0.007))
+    assert posterior_delay(DepthDelay(0.012, 0.0005, 20), 0.0, SETTINGS) == pytest.approx(0.012, rel=5e-3)
+    assert posterior_delay(DepthDelay(0.012, 0.0005, 20), 0.009, SETTINGS) == pytest.approx(0.003, rel=5e-3)
+    assert posterior_delay(DepthDelay(0.012, 0.0005, 20), 0.0115, SETTINGS) == 0.0
+    assert posterior_delay(DepthDelay(0.05, 0.0005, 20), 0.0, SETTINGS) == 0.0
+    sure, likely, hardly = (posterior_delay(DepthDelay(0.012, x, 20), 0.0, SETTINGS) for x in (0.003, 0.0045, 0.007))
     assert 0.010 < sure < 0.012
     assert 0.007 < likely < sure
     assert 0.0 <= hardly < likely
-    assert believed_delay(DepthDelay(0.004, 0.004, 20), 0.0, SETTINGS) == 0.0  # as likely chance
-    own = believed_delay(DepthDelay(0.0096, 0.0017, 20), 0.0137, SETTINGS)  # depth has stamps of its own
+    assert posterior_delay(DepthDelay(0.004, 0.004, 20), 0.0, SETTINGS) == 0.0  # as likely chance
+    own = posterior_delay(DepthDelay(0.0096, 0.0017, 20), 0.0137, SETTINGS)  # depth has stamps of its own
     assert own == 0.0
-    assert believed_delay(DepthDelay(0.0041, 0.0017, 20), 0.0, SETTINGS) > 0.002
+    assert posterior_delay(DepthDelay(0.0041, 0.0017, 20), 0.0, SETTINGS) > 0.002
 
 
 def test_what_is_believed_is_nearer_to_the_truth_on_average_than_what_is_measured_or_nothing() -> None:
@@ -120,7 +120,7 @@ def test_what_is_believed_is_nearer_to_the_truth_on_average_than_what_is_measure
     true = true[np.abs(true) < 0.02]
     for sigma in (0.001, 0.004, 0.008):
         seen = true + sigma * rng.standard_normal(len(true))
-        believed = np.array([believed_delay(DepthDelay(float(x), sigma, 20), 0.0, SETTINGS) for x in seen])
+        believed = np.array([posterior_delay(DepthDelay(float(x), sigma, 20), 0.0, SETTINGS) for x in seen])
         error = float(np.square(believed - true).mean())
         assert error < 1.05 * np.square(seen - true).mean()
         assert error < np.square(np.where(np.abs(seen) > 4 * sigma, seen, 0.0) - true).mean() + 1e-7
