@@ -47,8 +47,7 @@ def things_near(
     least_px: int,
     patches: Patches | None = None,
 ) -> Bool[Array, "h w"] | None:
-    """What of some pixels is a thing beside the object, with what of it looks like neither; None where there is none
-    of `least_px` pixels.
+    """What of some pixels is a thing beside the object; None where there is none of `least_px` pixels.
 
     Part of it stands before the scene, farther from the mask than stereo's rim, or has another colour than the scene.
     It is thicker than rims and shadows are, and most of it lies outside of the object's hull: within, it may be a side
