@@ -118,7 +118,8 @@ def best_law(forecasts: Forecasts) -> Law:
     """The best of a grid, then friction and restitution together and unexplained by itself, over narrower spans.
 
     Together, for more of one asks for less of the other: where one is sought at a time, the search ends beside the
-    valley of some tosses' scores (of three tosses with noise of their own size added, .27 to .34 for .2 in 3 of 16)."""
+    valley of some tosses' scores (of three tosses with noise of their own size added, .27 to .34 for .2 in 3 of 16).
+    """
     grid = [Law(float(f), e, UNEXPLAINED) for f in FRICTIONS for e in RESTITUTIONS]
     law = grid[int(forecasts.scores(grid).sum(1).argmin())]
     sides = np.array([-1.0, 0.0, 1.0])

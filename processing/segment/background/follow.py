@@ -122,9 +122,11 @@ def follow(
 
 @dataclass(frozen=True, eq=False)
 class _Sought:
-    """Where the object is sought: what moved, what of that nothing beside it owns, and where it is expected."""
+    """Where the object is sought: what moved, what that looks like (log-odds of the object), what of it nothing beside
+    the object owns, and where it is expected."""
 
     moved: Bool[Array, "h w"]
+    odds: Float32[Array, "h w"]
     own: Bool[Array, "h w"]
     expected: Bool[Array, "h w"]
     near: Bool[Array, "h w"]
@@ -172,7 +174,7 @@ def _sought(
     expected, own = shifted(memory.mask, came_px), moved
     if memory.others is not None and cues is None:
         own = without_others(frame, scene, moved, expected, came_px, memory.others, odds, reach, s.foreground)
-    return _Sought(moved, own, expected, grown(expected, reach))
+    return _Sought(moved, odds, own, expected, grown(expected, reach))
 
 
 def _bordered(
@@ -207,7 +209,10 @@ def _found(
     ratio = min(mask.sum(), memory.size_px) / max(mask.sum(), memory.size_px, 1)
     solid = sought.moved & sought.near & (frame.depth_m > 0)  # what only looks different may be the object's shadow
     solid &= ~(grown(rough, 3) if sought.own is sought.moved else rough)
-    others = things_near(frame, scene, solid, rough, s.foreground, s.least_px, memory.patches)
+    if memory.patches is not None:
+        looks = sought.odds if memory.others is not None else memory.patches.log_odds(frame.color_rgb, solid)
+        solid &= looks < 0
+    others = things_near(frame, scene, solid, rough, s.foreground, s.least_px)
     largest = largest_other(frame, scene, sought.moved & ~grown(mask, 9), s.foreground, s.least_px)
     return Found(mask, float(np.clip(sure * min(1.0, ratio / 0.7), 0, 1)), others, largest)
 

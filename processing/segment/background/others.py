@@ -16,7 +16,6 @@ from processing.segment.background.foreground import (
     smooth,
     window_around,
 )
-from processing.segment.background.patches import Patches
 from processing.segment.background.placement import best_shift, shifted
 from processing.segment.background.static_scene import StaticScene, most_of_channels
 from recordings.records import RgbdFrame
@@ -45,27 +44,23 @@ def things_near(
     mask: Bool[Array, "h w"],
     s: ForegroundSettings,
     least_px: int,
-    patches: Patches | None = None,
 ) -> Bool[Array, "h w"] | None:
     """What of some pixels is a thing beside the object; None where there is none of `least_px` pixels.
 
     Part of it stands before the scene, farther from the mask than stereo's rim, or has another colour than the scene.
     It is thicker than rims and shadows are, and most of it lies outside of the object's hull: within, it may be a side
-    that was never seen. `patches`: what the object looks like, where that was learned.
+    that was never seen.
     """
-    if solid.sum() <= least_px:
+    at = window_around(solid, 0)
+    if at is None or solid.sum() <= least_px:
         return None
-    others = solid if patches is None else solid & (patches.log_odds(frame.color_rgb, solid) < 0)
-    at = window_around(others, 0)
-    if at is None:
-        return None
-    told = np.zeros_like(others)
+    told = np.zeros_like(solid)
     told[at] = ~scene_colored(frame, scene, at, s)
     told |= nearer_than_scene(frame.depth_m, scene, s) & ~grown(mask, RIM_PX)
-    told = _apart(others & scene.known & told, mask, s)
+    told = _apart(solid & scene.known & told, mask, s)
     radius = max(s.band_inside_px, round(THICK * float(np.sqrt(mask.sum()))))
-    thick = cv2.morphologyEx(others.astype(np.uint8), cv2.MORPH_OPEN, kernel(radius))
-    bodies = (cv2.dilate(thick, kernel(NEAR_THICK * radius)) > 0) & others
+    thick = cv2.morphologyEx(solid.astype(np.uint8), cv2.MORPH_OPEN, kernel(radius))
+    bodies = (cv2.dilate(thick, kernel(NEAR_THICK * radius)) > 0) & solid
     count, labels = cv2.connectedComponents(bodies.astype(np.uint8), connectivity=4)
     sizes, inside, known = (np.bincount(labels[p], minlength=count) for p in (bodies, _hull(mask), told))
     keep = (known > least_px) & (inside < MOST_INSIDE * sizes)

@@ -42,7 +42,7 @@ class _Samples:
 
 @dataclass(frozen=True, eq=False)
 class Patches:
-    """What was learned, the first frame first; `age`: frames since. `forest`: OpenCV's `RTrees`."""
+    """What was learned, the first frame first; `age`: frames since one was learned. `forest`: OpenCV's `RTrees`."""
 
     samples: tuple[_Samples, ...]
     size_px: float
