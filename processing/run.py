@@ -12,6 +12,7 @@ from processing.config import Config
 from processing.sensor.noise import PUBLISHED, DepthNoise
 from processing.sensor.still import Kept
 from processing.store import Store, plain
+from processing.track.noise_cost import at_noise
 from recordings.geometry import CameraModel, Transform
 from recordings.notices import Notice
 from recordings.progress import Progress
@@ -90,9 +91,7 @@ def matcher_settings(run: Run, config: Any) -> dict[str, Any]:
 
 def with_noise(run: Run, noise: DepthNoise) -> Run:
     """The run in which depth is believed as far as this session's noise allows."""
-    track = run.config.track
-    track = replace(track, view=replace(track.view, turn_share=noise.turn_share))
-    return replace(run, noise=noise, config=replace(run.config, track=track))
+    return replace(run, noise=noise, config=replace(run.config, track=at_noise(run.config.track, noise)))
 
 
 def each(run: Run, items: Iterable[Item], call: Callable[[Item], Found]) -> dict[Item, Found]:

@@ -13,6 +13,7 @@ from processing.config import SecondPassStart
 from processing.images import Images
 from processing.run import CAMERA, Run, matcher_settings
 from processing.store import Done
+from processing.track.flags import unfit
 from processing.track.notes import notes_of
 from processing.track.track_file import write_toss_track
 from processing.track.track_toss import track_toss
@@ -21,7 +22,7 @@ from recordings.results.folder import read_shape, read_track, write_track
 from recordings.results.track_notes import write_notes
 from recordings.tracks import ObjectTrack
 
-VERSION = 19
+VERSION = 20
 
 
 @dataclass(frozen=True)
@@ -63,7 +64,7 @@ def track(
         write_toss_track(folder, tracked)
         if before is None:
             write_notes(folder, images.toss, *notes_of(tracked, matcher_of(run.config.backends, run.device)))
-        return _result(tracked.track, tracked.unfit)
+        return _result(tracked.track, unfit(tracked.store, tracked.cost, run.config.track.flags))
 
     config = matcher_settings(run, run.config.track)
     config |= {} if before is None else {"second_pass": start_with}

@@ -25,6 +25,8 @@ class FlagConfig:
 
     tracked_cost: float = 0.25
     """After refinement, a view that fits its neighbours worse on average is lost."""
+    unfit_cost: float = 0.15
+    """A view that costs more no pose explains: one rigid body fits better, however it looks."""
     longest_gap_s: float = 0.2
     """Frames between tracked ones that are at most this far apart get an interpolated pose."""
     gap_sigma_rad: float = 0.15
@@ -49,6 +51,13 @@ class FlagConfig:
     unsure_deg: float = 15.0
     """A pose whose rotation may be off by more than this (standard deviation) is a guess, marked as interpolated: a
     flip (45 degrees) lies within three of them."""
+
+
+def unfit(store: ViewStore, cost: Float[Array, " n"], config: FlagConfig) -> int:
+    """Frames that no pose explains (those that show nothing do not count): where they are many, the masks do not show
+    one rigid body."""
+    seen = np.array([store.usable(i) for i in range(len(cost))], dtype=bool)
+    return int(np.sum(seen & ~(cost < config.unfit_cost)))
 
 
 def per_view(pairs: Int[Array, "m 2"], figures: Float[Array, "m 3"], n: int) -> tuple[Array, Array]:

@@ -48,9 +48,6 @@ from recordings.progress import Progress, Silent
 from recordings.records import RgbdFrame
 from recordings.tracks import ObjectShape, ObjectTrack
 
-UNFIT_COST = 0.15
-"""Of a frame against those that see the same surface: one rigid body fits better, however it looks."""
-
 
 @dataclass(frozen=True)
 class TrackConfig:
@@ -101,17 +98,6 @@ class TossTrack:
     def tied(self) -> Int[Array, " n"]:
         """Frames with the same number lie to each other as they do; -1: to no others."""
         return np.zeros_like(self.held) if self.round_body else self.held
-
-    @property
-    def unfit(self) -> int:
-        """Frames that no pose fits: where they are many, the masks do not show one rigid body."""
-        return int(np.sum(~self.fits))
-
-    @property
-    def fits(self) -> Bool[Array, " n"]:
-        """Whether a pose explains what each looked-at frame shows (frames that show nothing count as fitting)."""
-        seen = np.array([self.store.usable(i) for i in range(len(self.cost))], dtype=bool)
-        return ~seen | (self.cost < UNFIT_COST)
 
 
 @dataclass(frozen=True, eq=False)

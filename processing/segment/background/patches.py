@@ -1,4 +1,4 @@
-"""Whose surface a pixel shows, the object's or a hand's, by the colours and the contrast around it.
+"""Whose surface a pixel shows, the object's, a hand's or the scene's, by the colours and the contrast around it.
 
 A colour alone does not tell: a hand has shades that a striped box has too. What either looks like at three scales is
 learned by a random forest (Breiman 2001) from the frame in which the object is known best, which is never forgotten.
@@ -22,8 +22,10 @@ SCALES, LEAST_PX = (0.01, 0.025, 0.06), 0.7
 """Of the blurs, as shares of the object's size in the image, and no less than this."""
 REACH = 4
 """Standard deviations of a blur beyond which nothing counts."""
+SCENE_REACH, RIM_PX = 0.6, 5
+"""The scene beside the object is learned from as far as this share of the object's size, and no nearer than this."""
 SAMPLES, LEAST_SAMPLES = 300, 100
-"""Pixels of either that are learned from a frame, and how many it must show."""
+"""Pixels of each that are learned from a frame, and how many it must show."""
 RECENT, EVERY = 4, 5
 """So many later frames are remembered beside the first, which counts as much as all of them; every so many frames one
 is learned."""
@@ -67,7 +69,7 @@ class Patches:
         return Patches(kept, self.size_px, _trained(kept))
 
     def log_odds(self, color_rgb: UInt8[Array, "h w 3"], where: Bool[Array, "h w"]) -> Float32[Array, "h w"]:
-        """log(P(object) / P(others)) of the pixels of a mask, within +-MOST; 0 elsewhere."""
+        """log(P(object) / P(others or scene)) of the pixels of a mask, within +-MOST; 0 elsewhere."""
         out, at = np.zeros(where.shape, np.float32), window_around(where, _margin(self.size_px))
         if at is None:
             return out
@@ -96,14 +98,24 @@ def _features(color_rgb: UInt8[Array, "h w 3"], size_px: float) -> Float32[Array
 def _samples(
     color_rgb: UInt8[Array, "h w 3"], mask: Bool[Array, "h w"], others: Bool[Array, "h w"], size_px: float, count: int
 ) -> _Samples | None:
-    """`count` pixels of the mask's core and as many of what lies beside it, drawn with replacement."""
-    at = window_around(mask | others, _margin(size_px))
+    """As many pixels of the mask's core as of what is not the object's: `count` of what lies beside it, and `count` of
+    the scene around it, drawn with replacement."""
+    reach = round(SCENE_REACH * size_px)
+    at = window_around(mask | others, reach + _margin(size_px))
     core, beside = cv2.erode(mask.astype(np.uint8), kernel(1)) > 0, others & ~grown(mask, 2)
     if at is None or min(core.sum(), beside.sum()) < LEAST_SAMPLES:
         return None
+    scene = grown(mask, reach) & ~grown(mask | others, RIM_PX)
+    foreign = [beside, scene] if scene.sum() >= LEAST_SAMPLES else [beside]
     features, rng = _features(color_rgb[at], size_px), np.random.default_rng(0)
-    chosen = [part[rng.integers(len(part), size=count)] for part in (features[core[at]], features[beside[at]])]
-    return _Samples(np.concatenate(chosen), np.repeat(np.array([1, 0], np.int32), count))
+
+    def drawn(part: Bool[Array, "h w"], wanted: int) -> Float32[Array, "n f"]:
+        found = features[part[at]]
+        return found[rng.integers(len(found), size=wanted)]
+
+    chosen = [drawn(core, len(foreign) * count), *(drawn(part, count) for part in foreign)]
+    classes = np.repeat(np.array([1, 0], np.int32), len(foreign) * count)
+    return _Samples(np.concatenate(chosen), classes)
 
 
 def _trained(samples: tuple[_Samples, ...]) -> Any:

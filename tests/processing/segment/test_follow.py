@@ -198,6 +198,24 @@ def test_two_that_have_one_mean_colour_are_told_apart_by_their_contrast() -> Non
     assert not odds[:20].any()
 
 
+def test_the_table_between_a_hands_fingers_is_neither_hand_nor_object() -> None:
+    """Stereo gives it the hand's depth; it has a shade that the object shows too, and the hand does not."""
+    rng = np.random.default_rng(0)
+    seen = frame((np.s_[30:90, 60:120], (225, 180, 150), 0.8), (np.s_[40:80, 76:104], GREY, 0.8))
+    mask = np.zeros((H, W), dtype=bool)
+    mask[50:100, 80:100] = True
+    seen.color_rgb[mask] = np.clip(rng.normal(GREY, 60, (int(mask.sum()), 3)), 0, 255)
+    hand = np.zeros_like(mask)
+    hand[30:90, 60:120] = True
+    hand[40:80, 76:104] = False
+    patches = Patches.of(seen.color_rgb, mask, hand & ~mask)
+    assert patches is not None
+    gap = np.zeros_like(mask)
+    gap[42:48, 78:102] = True
+    assert np.median(patches.log_odds(seen.color_rgb, gap)[gap]) < -1
+    assert np.median(patches.log_odds(seen.color_rgb, mask)[mask]) > 1
+
+
 def test_a_thing_beside_the_object_is_neither_its_rim_nor_a_side_of_it_that_was_never_seen() -> None:
     scene, s, least = empty_scene(), ForegroundSettings(), 120
     mask = np.zeros((H, W), dtype=bool)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from processing.evaluate.metrics import align_first, frame_errors
-from processing.track.flags import FlagConfig, uncertainty
+from processing.track.flags import FlagConfig, uncertainty, unfit
 from processing.track.track_toss import TossTrack, track_toss
 from recordings.errors import BadInput
 from recordings.geometry import Transform, rotation_exp
@@ -95,8 +95,8 @@ def test_two_objects_under_one_mask_are_not_taken_for_one_rigid_body(tiny_world:
         frames.append(replace(frame, depth_m=depth_m, color_rgb=color))
         masks.append(mask | other_mask)
     one, two = followed(tiny_world, toss[0][:count], toss[1][:count]), followed(tiny_world, frames, masks)
-    assert one.unfit == 0
-    assert two.unfit > 0.5 * count
+    assert unfit(one.store, one.cost, FlagConfig()) == 0
+    assert unfit(two.store, two.cost, FlagConfig()) > 0.5 * count
 
 
 def test_another_hypothesis_of_the_same_frames_adds_uncertainty() -> None:
