@@ -22,8 +22,9 @@ from processing.stages.track import TrackResult, track
 from processing.store import Done
 from recordings.errors import BadInput
 
-TURNS = 2
-"""The second turn is for tosses that the first one left open: on shapes that it corrected."""
+TURNS, GAIN = 6, 0.03
+"""A further turn is for tosses whose misfit fell by more than this in the last one, and the second for those that the
+first left open, too: on shapes that it corrected."""
 FOLDS = 3
 """Into so many parts many tosses are split, each tracked on the others' shape; fewer tosses are left out singly."""
 
@@ -32,20 +33,24 @@ def cross_fitted(
     run: Run, images: Mapping[int, Images], tracks: Mapping[int, Done], alone: Mapping[int, Done[TrackResult]]
 ) -> dict[int, Done]:
     """The tracks of tosses in one object frame, each the best of: what it was, refined on the others' shape, and, of a
-    toss that tracked `alone` left a rotation open or lost frames, the object located anew on that shape."""
+    toss that tracked `alone` left a rotation open or lost frames, the object located anew on that shape. It goes on
+    while tosses gain by it."""
     best, results = dict(tracks), {t: alone[t].result for t in tracks}
     if len(best) < 2:
         return best
     again = tuple(best)
-    for _ in range(TURNS):
-        for fold in worst_first(run, {t: best[t] for t in again}, images):
+    for turn in range(TURNS):
+        misfits = own_misfits(run, {t: best[t] for t in again}, images)
+        for fold in worst_first(misfits):
             shape = fused(run, without(best, fold), images)
             if shape is None:  # nothing that the others show is sure
                 continue
             found = refitted(run, {t: best[t] for t in fold}, shape, images, results)
             results |= {t: done.result for t, done in found.items() if done.key != best[t].key}
             best |= found
-        again = tuple(t for t in again if is_open(run, results[t]))
+        now = own_misfits(run, {t: best[t] for t in again}, images)
+        left_open = [t for t in again if turn == 0 and is_open(run, results[t])]
+        again = tuple(t for t in again if t in left_open or now[t] < misfits[t] - GAIN)
         if not again:
             break
     return best
@@ -66,12 +71,16 @@ def refitted(
     return each(run, tracks, lambda t: chosen(run, tracks[t], shape, images[t], is_open(run, results[t])))
 
 
-def worst_first(run: Run, tracks: Mapping[int, Done], images: Mapping[int, Images]) -> list[tuple[int, ...]]:
+def own_misfits(run: Run, tracks: Mapping[int, Done], images: Mapping[int, Images]) -> dict[int, float]:
+    """How badly each toss fits itself."""
+    return each(run, tracks, lambda t: misfit(on_itself(run, tracks[t], images[t])))
+
+
+def worst_first(misfits: Mapping[int, float]) -> list[tuple[int, ...]]:
     """The tosses by how badly they fit themselves, in folds: what fits worst is corrected first, on the shape of what
     fits better, and the next fold on the shape of what was corrected. (All at once would exchange the places of two
     tosses that lie wrongly to each other, and never join them.)"""
-    misfits = each(run, tracks, lambda t: misfit(on_itself(run, tracks[t], images[t])))
-    order = sorted(tracks, key=lambda t: -misfits[t])
+    order = sorted(misfits, key=lambda t: -misfits[t])
     return [tuple(int(t) for t in part) for part in np.array_split(order, min(FOLDS, len(order)))]
 
 

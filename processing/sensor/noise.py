@@ -67,11 +67,15 @@ class DepthNoise:
     patch_px: float
 
     @property
-    def turn_share(self) -> float:
-        """Of what depth says of turns, how much counts beside appearance: the variance of a mean over pixels that err
-        alike, that of fine depth in units of this one's."""
+    def coarseness(self) -> float:
+        """Variance of a mean over pixels that err alike, in units of fine depth's."""
         variance, fine = (n.sigma_at_1m**2 * n.patch_px for n in (self, FINE))
-        return float(np.clip(fine / max(variance, 1e-12), LEAST_TURN_SHARE, 1.0))
+        return variance / fine
+
+    @property
+    def turn_share(self) -> float:
+        """Of what depth says of turns, how much counts beside appearance."""
+        return float(np.clip(1.0 / max(self.coarseness, 1e-12), LEAST_TURN_SHARE, 1.0))
 
 
 PUBLISHED = DepthNoise(0.005, 49.0)

@@ -31,12 +31,13 @@ def at_noise(config: TrackConfig, noise: DepthNoise) -> TrackConfig:
     more = max(0.0, pair_cost(noise, scale_m, window_px) - pair_cost(FINE, scale_m, window_px))
     flags, beam, graph = config.flags, config.beam, config.hypotheses.graph
     flags = replace(flags, tracked_cost=flags.tracked_cost + more, joining_cost=flags.joining_cost + more,
-                    unfit_cost=flags.unfit_cost + more)  # fmt: skip
+                    unfit_cost=flags.unfit_cost + more,
+                    correlated=flags.correlated * max(1.0, noise.coarseness))  # fmt: skip
     return replace(
         config,
         view=replace(config.view, turn_share=noise.turn_share),
         flags=flags,
-        beam=replace(beam, uncertain_cost=beam.uncertain_cost + more),
+        beam=replace(beam, uncertain_cost=beam.uncertain_cost + more, search=beam.search + more, lost=beam.lost + more),
         hypotheses=replace(config.hypotheses, graph=replace(graph, sure_cost=graph.sure_cost + more)),
     )
 

@@ -123,10 +123,38 @@ def test_the_worst_toss_comes_first_and_every_toss_once(
     tosses = Tosses(tiny_world, tmp_path, 1)
     run, images = tosses.run, dict.fromkeys(range(7), tosses.images[0])
     monkeypatch.setattr(cross_fit, "on_itself", lambda _, done, __: seen({"3": 5.0, "6": 4.0}.get(done.key, 1.0)))
-    folds = cross_fit.worst_first(run, {t: Done(tmp_path, str(t), None, False) for t in range(7)}, images)
+    tracks = {t: Done(tmp_path, str(t), None, False) for t in range(7)}
+    folds = cross_fit.worst_first(cross_fit.own_misfits(run, tracks, images))
     assert folds[0][:2] == (3, 6)
     assert len(folds) == cross_fit.FOLDS
     assert sorted(t for fold in folds for t in fold) == list(range(7))
+
+
+@pytest.mark.parametrize(
+    ("depth_mm", "turns"), [([4.0, 3.0, 2.5, 2.49], 3), ([4.0, 3.95], 1), ([9.0 / k for k in range(1, 20)], 6)]
+)
+def test_it_goes_on_with_the_tosses_that_gained(
+    depth_mm: list[float], turns: int, monkeypatch: pytest.MonkeyPatch, tiny_world: Any, tmp_path: Path
+) -> None:
+    """Toss 1 fits so after each turn; toss 0 gains nothing."""
+    tosses = Tosses(tiny_world, tmp_path, 2)
+    tracks = {t: Done(tmp_path, f"{t} 0", SURE, False) for t in (0, 1)}
+    asked: list[str] = []
+
+    def chosen(_: Any, before: Done, *__: Any) -> Done:
+        toss, turn = before.key.split()
+        asked.append(toss)
+        return before if toss == "0" else Done(tmp_path, f"1 {int(turn) + 1}", SURE, False)
+
+    def on_itself(_: Any, done: Done, __: Any) -> Explained:
+        toss, turn = done.key.split()
+        return seen(1.0 if toss == "0" else depth_mm[int(turn)])
+
+    monkeypatch.setattr(cross_fit, "chosen", chosen)
+    monkeypatch.setattr(cross_fit, "on_itself", on_itself)
+    monkeypatch.setattr(cross_fit, "fused", lambda *_: tracks[0])
+    cross_fit.cross_fitted(tosses.run, tosses.images, tracks, tracks)
+    assert asked == ["1", "0", *["1"] * (turns - 1)]
 
 
 def test_one_toss_stays_as_it_is(tiny_world: Any, tmp_path: Path) -> None:
