@@ -40,12 +40,14 @@ def first_pass(run: Run, alone: Mapping[int, Done], images: Mapping[int, Images]
         apart, tosses = (*apart, *alien), tuple(t for t in tosses if t not in alien)
     fitted = cross_fitted(run, images, dict.fromkeys(joined, placed), alone)
     found = located(run, images, fitted, [t for t in run.tosses if t not in joined])
+    if found:  # the others have not been on a shape with what these show
+        fitted = cross_fitted(run, images, {**fitted, **found}, {**alone, **found})
     apart = tuple(sorted(t for t in apart if t not in found))
     warnings += [say.kept_apart(apart)] if apart else []
     warnings += say.of_register(placed, found)
-    tracks = {**dict.fromkeys(tosses, placed), **fitted, **found}
+    tracks = {**dict.fromkeys(tosses, placed), **fitted}
     tracks = {t: tracks[t] for t in run.tosses if t not in apart}
-    shape = learn_field(run, "all tosses", {**fitted, **found}, images)
+    shape = learn_field(run, "all tosses", fitted, images)
     return Pass(tracks, dict.fromkeys(tracks, shape), shared_frame=not apart, warnings=tuple(warnings))
 
 

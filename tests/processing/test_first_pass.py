@@ -115,10 +115,17 @@ def test_the_others_are_joined_anew_without_a_toss_that_is_kept_apart(
     fakes = {"register": register, "learn_field": field, "kept_apart": apart, "fuse_frames": fuse, "located": located}
     for name, fake in fakes.items():
         monkeypatch.setattr(first_pass, name, fake)
-    monkeypatch.setattr(first_pass, "cross_fitted", lambda _, __, tracks, ___: tracks)
+    asked: list[list[int]] = []
+
+    def cross_fitted(_: Run, __: Any, tracks: dict[int, Done], ___: Any) -> dict[int, Done]:
+        asked.append(sorted(tracks))
+        return tracks
+
+    monkeypatch.setattr(first_pass, "cross_fitted", cross_fitted)
     found = first_pass.first_pass(run, alone, {})
     others = {0: "together [0, 2]", 2: "together [0, 2]"}
     assert {t: d.key for t, d in found.tracks.items()} == (others | {1: "located"} if found_again else others)
+    assert asked == [[0, 2], *([[0, 1, 2]] if found_again else [])]
     assert {d.key for d in found.shapes.values()} == {f"all tosses {sorted(found.tracks)}"}
     assert found.shared_frame == found_again
     assert any("kept apart" in w.text for w in found.warnings) != found_again
