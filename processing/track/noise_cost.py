@@ -1,7 +1,8 @@
 """What depth's noise makes views cost at their true poses, and the tracker's thresholds raised by it.
 
 The costs of pairs of views were told apart on depth as fine as `noise.FINE`. Where a session's depth is worse, the true
-poses cost more: thresholds that stay where they were call frames lost, or not joined, that lie within a degree.
+poses cost more: thresholds that stay where they were call frames lost that lie within a degree. The cost up to which a
+pair fixes how one view is turned against the other stays: noise says no more of turns for being known.
 """
 
 from __future__ import annotations
@@ -30,8 +31,7 @@ def at_noise(config: TrackConfig, noise: DepthNoise) -> TrackConfig:
     scale_m, window_px = config.hypotheses.graph.schedule[-1][k.GEOMETRY_M], config.view.window_px
     more = max(0.0, pair_cost(noise, scale_m, window_px) - pair_cost(FINE, scale_m, window_px))
     flags, beam, graph = config.flags, config.beam, config.hypotheses.graph
-    flags = replace(flags, tracked_cost=flags.tracked_cost + more, joining_cost=flags.joining_cost + more,
-                    unfit_cost=flags.unfit_cost + more,
+    flags = replace(flags, tracked_cost=flags.tracked_cost + more, unfit_cost=flags.unfit_cost + more,
                     correlated=flags.correlated * max(1.0, noise.coarseness))  # fmt: skip
     return replace(
         config,

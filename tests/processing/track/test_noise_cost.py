@@ -14,7 +14,7 @@ from processing.sensor.noise import FINE, DepthNoise
 from processing.track.noise_cost import at_noise, pair_cost
 from processing.track.track_toss import TossTrack, TrackConfig, track_toss
 
-COARSE = DepthNoise(0.022, 20.0)
+COARSE = DepthNoise(0.03, 20.0)
 
 
 @pytest.mark.parametrize("noise", [FINE, DepthNoise(0.008, 200.0), DepthNoise(0.02, 20.0)])
@@ -49,7 +49,7 @@ def noisy(frames: Any, noise: DepthNoise, seed: int) -> list[Any]:
     return found
 
 
-def test_frames_of_a_coarse_camera_that_lie_right_are_tracked(tiny_world: Any) -> None:
+def test_frames_of_a_coarse_camera_that_lie_right_are_not_lost(tiny_world: Any) -> None:
     poses = tiny_world.poses(5, 0)
     seen = [tiny_world.see(pose, i) for i, pose in enumerate(poses)]
     truth = np.stack([(tiny_world.world_from_camera.inverse() @ p).matrix for p in poses])
@@ -62,7 +62,7 @@ def test_frames_of_a_coarse_camera_that_lie_right_are_tracked(tiny_world: Any) -
     fine, coarse = followed(TrackConfig()), followed(at_noise(TrackConfig(), COARSE))
     estimate = coarse.track.camera_from_object
     errors = frame_errors(estimate @ align_first(estimate, truth), truth, np.eye(3) * 0.05)
-    assert fine.track.status.count("tracked") < 3
-    assert set(coarse.track.status) == {"tracked"}
+    assert fine.track.status.count("lost") > 2
+    assert "lost" not in coarse.track.status
     assert errors.rotation_deg.max() < 5.0
     assert errors.translation_m.max() < 0.005
