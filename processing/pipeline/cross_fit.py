@@ -22,7 +22,7 @@ from processing.stages.track import TrackResult, track
 from processing.store import Done
 from recordings.errors import BadInput
 
-TURNS, GAIN = 6, 0.03
+TURNS, GAIN = 6, 0.1
 """A further turn is for tosses whose misfit fell by more than this in the last one, and the second for those that the
 first left open, too: on shapes that it corrected."""
 FOLDS = 3
