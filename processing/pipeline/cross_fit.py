@@ -39,18 +39,18 @@ def cross_fitted(
     if len(best) < 2:
         return best
     again = tuple(best)
+    misfits = own_misfits(run, best, images)
     for turn in range(TURNS):
-        misfits = own_misfits(run, {t: best[t] for t in again}, images)
-        for fold in worst_first(misfits):
+        for fold in worst_first({t: misfits[t] for t in again}):
             shape = fused(run, without(best, fold), images)
             if shape is None:  # nothing that the others show is sure
                 continue
             found = refitted(run, {t: best[t] for t in fold}, shape, images, results)
             results |= {t: done.result for t, done in found.items() if done.key != best[t].key}
             best |= found
-        now = own_misfits(run, {t: best[t] for t in again}, images)
+        earlier, misfits = misfits, own_misfits(run, {t: best[t] for t in again}, images)
         left_open = [t for t in again if turn == 0 and is_open(run, results[t])]
-        again = tuple(t for t in again if t in left_open or now[t] < misfits[t] - GAIN)
+        again = tuple(t for t in again if t in left_open or misfits[t] < earlier[t] - GAIN)
         if not again:
             break
     return best
