@@ -8,7 +8,8 @@ from collections.abc import Mapping
 from processing.pipeline import notices as say
 from processing.pipeline.passes import Pass
 from processing.run import Run
-from processing.stages.recording.every_frame import in_every_frame
+from processing.segment.background.depth_scale import posterior_sigma
+from processing.stages.recording.every_frame import masks_in_every_frame, poses_in_every_frame
 from processing.stages.recording.rig import RigResult
 from processing.stages.recording.scene import SceneResult, scene_notes
 from processing.stages.segment import SegmentResult
@@ -24,10 +25,12 @@ def write_record(
 ) -> VariantRecord:  # fmt: skip
     """variants/<name>.<scope>.json. A toss in `lost` has no pose; its shape is said to be that of the first toss."""
     tracks, shapes = {**last.tracks, **lost}, {**last.shapes, **dict.fromkeys(lost, last.shape)}
+    scale_sigma = posterior_sigma(rig.result.scale_sigma, run.config.rig.scale)
     tosses = tuple(
-        TossRecord(t, in_every_frame(run, t, tracks[t]).name, shapes[t].name, in_every_frame(run, t, masks[t]).name)
+        TossRecord(t, poses_in_every_frame(run, t, tracks[t], scale_sigma).name, shapes[t].name,
+                   masks_in_every_frame(run, t, masks[t]).name)
         for t in run.recorded
-    )
+    )  # fmt: skip
     contact = {str(t): done.name for t, done in last.contact.items()}
     of_stages = [*say.of_run(run, rig, masks), *(n for done in last.contact.values() for n in say.of_contact(done))]
     record = VariantRecord(

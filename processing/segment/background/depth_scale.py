@@ -75,3 +75,10 @@ def posterior_scale(scale: float, sigma: float, settings: DepthScaleSettings) ->
         return 1.0
     told = settings.among_cameras**2 / (settings.among_cameras**2 + sigma**2)
     return 1.0 + told * (scale - 1.0)
+
+
+def posterior_sigma(sigma: float | None, settings: DepthScaleSettings) -> float:
+    """The standard deviation of that posterior; `sigma`: of the estimate, None where nothing tells."""
+    if sigma is None:
+        return settings.among_cameras
+    return float(settings.among_cameras * sigma / np.hypot(settings.among_cameras, sigma))

@@ -1,4 +1,5 @@
-"""Stage `every-frame`: the masks and poses of the frames that were not worked on."""
+"""Stage `every-frame`: what results say of every frame: masks and poses of those that were not worked on, too, and how
+far depth's scale may carry them all."""
 
 from __future__ import annotations
 
@@ -6,12 +7,18 @@ import shutil
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray as Array
+
 from processing.run import Run
 from processing.sensor.still import Kept, whole_session
 from processing.store import Done
 from recordings.results.folder import RobotMasks, read_masks, read_track, write_masks, write_track
+from recordings.results.track_notes import FIT, NOTES
+from recordings.tracks import ObjectTrack
 
-VERSION = 2
+VERSION = 3
 
 
 @dataclass(frozen=True)
@@ -22,28 +29,61 @@ class EveryFrameResult:
     worked_on: int
 
 
-def in_every_frame(run: Run, toss: int, done: Done) -> Done:
-    """A stage's track and masks of one toss in every frame that was recorded (stage `every-frame`)."""
-    if toss not in run.kept:
-        return done
-    kept, frames = run.kept[toss], whole_session(run.session).toss(toss).rgbd(run.camera.frame)
-    stem = f"toss_{toss:02d}"
+def poses_in_every_frame(run: Run, toss: int, done: Done, scale_sigma: float) -> Done:
+    """A stage's track of one toss in every frame that was recorded; `scale_sigma`: standard deviation of depth's
+    scale. What the tracker noted of its frames goes with it where these are all frames."""
+    kept = run.kept.get(toss)
+    inputs = {f"track_{toss:02d}": done.key} if kept is None else {"thinned": done.key, "kept": kept.digest}
 
     def compute(folder: Path) -> EveryFrameResult:
-        if (done.folder / f"{stem}.track.npz").exists():
-            track = read_track(done.folder, toss)
+        track = read_track(done.folder, toss)
+        count = len(track.status)
+        if kept is None:
+            for noted in (FIT.format(toss), NOTES.format(toss)):
+                if (done.folder / noted).exists():
+                    shutil.copyfile(done.folder / noted, folder / noted)
+        else:
+            times_ns = whole_session(run.session).toss(toss).rgbd(run.camera.frame).times_ns
             status = tuple(track.status[i] for i in kept.like)
             poses, covariance = (x[kept.like] for x in (track.camera_from_object, track.covariance))
-            write_track(folder, replace(track, time_ns=frames.times_ns, camera_from_object=poses, status=status,
-                                        covariance=covariance))  # fmt: skip
-        if (done.folder / f"{stem}.masks").exists():
-            seen = read_masks(done.folder, toss)
-            write_masks(folder, toss, [seen[int(i)] for i in kept.like], seen.confidence[kept.like])
-            _copy_robot(RobotMasks.of(done.folder, toss), folder / f"{stem}.robot", kept)
+            track = replace(track, time_ns=times_ns, camera_from_object=poses, status=status, covariance=covariance)
+        write_track(folder, scaled_by_chance(track, scale_sigma))
+        return EveryFrameResult(len(track.status), count)
+
+    config = {"toss": toss, "scale_sigma": scale_sigma}
+    return run.store.run("every-frame", VERSION, config, inputs, EveryFrameResult, compute)
+
+
+def masks_in_every_frame(run: Run, toss: int, done: Done) -> Done:
+    """A stage's masks of one toss in every frame that was recorded."""
+    if toss not in run.kept:
+        return done
+    kept = run.kept[toss]
+
+    def compute(folder: Path) -> EveryFrameResult:
+        seen = read_masks(done.folder, toss)
+        write_masks(folder, toss, [seen[int(i)] for i in kept.like], seen.confidence[kept.like])
+        _copy_robot(RobotMasks.of(done.folder, toss), folder / f"toss_{toss:02d}.robot", kept)
         return EveryFrameResult(len(kept.like), len(kept.positions))
 
     inputs = {"thinned": done.key, "kept": kept.digest}
-    return run.store.run("every-frame", VERSION, {"toss": toss}, inputs, EveryFrameResult, compute)
+    return run.store.run("every-frame", VERSION, {"toss": toss, "masks": True}, inputs, EveryFrameResult, compute)
+
+
+def scaled_by_chance(track: ObjectTrack, sigma: float) -> ObjectTrack:
+    """The track, its covariances with what depth's scale, known to `sigma` (standard deviation), adds to them.
+
+    A scale that is wrong by d moves every position p by d p. The object frame is where the first pose has it, which
+    takes the shift of that frame away from all others, in object axes: at pose (R, p) d (p - R R0^T p0) are left.
+    """
+    posed = np.flatnonzero(~track.lost)
+    if len(posed) == 0:
+        return track
+    R, p = track.camera_from_object[posed, :3, :3], track.camera_from_object[posed, :3, 3]
+    shift: Float[Array, "m 3"] = p - R @ (R[0].T @ p[0])
+    covariance = track.covariance.copy()
+    covariance[posed, 3:, 3:] += sigma**2 * shift[:, :, None] * shift[:, None, :]
+    return replace(track, covariance=covariance)
 
 
 def _copy_robot(robot: RobotMasks | None, to: Path, kept: Kept) -> None:
