@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from numpy import ndarray as Array
 from scipy.special import stdtrit
 
@@ -113,7 +113,8 @@ def curvature(model: Model, optimum: Float[Array, " p"], data: StepData, weights
             H[i, j] = H[j, i] = float(mixed.mean()) / (2 * steps[i] * steps[j])
     size = extents(model.numbers(optimum).points_m.cpu().numpy())
     prior = np.array([PRIOR_FRICTION, *(PRIOR_SIZE_M / size)])
-    covariance, freedom = _sandwich(H, gradient, data, prior)
+    lasting = max(1, round(CONTACT_LASTS_S / float(np.median(data.steps.step_s))))
+    covariance, freedom = _sandwich(H, gradient, data.steps.toss, lasting, prior)
     model_error = np.array([MODEL_FRICTION] + [MODEL_SIZE] * 3)
     curved = float(stdtrit(freedom, 0.975)) * np.sqrt(np.diag(covariance))
     width = np.sqrt(curved**2 + (1.96 * model_error) ** 2)
@@ -121,22 +122,23 @@ def curvature(model: Model, optimum: Float[Array, " p"], data: StepData, weights
 
 
 def _sandwich(
-    H: Float[Array, "4 4"], gradient: Float[Array, "n 4"], data: StepData, prior: Float[Array, "4"]
+    H: Float[Array, "4 4"], gradient: Float[Array, "n 4"], toss: Int[Array, " n"], lag: int, prior: Float[Array, "4"]
 ) -> tuple[Float[Array, "4 4"], float]:
-    """(information of the data + of the prior)^-1, and the degrees of freedom: contacts less parameters."""
+    """(information of the data + of the prior)^-1, and the degrees of freedom: contacts less parameters. Gradients of
+    one contact lie up to `lag` transitions apart."""
     n = len(gradient)
-    lag = max(1, round(CONTACT_LASTS_S / float(np.median(data.steps.step_s))))
     centered = gradient - gradient.mean(0)
     G = centered.T @ centered
     for k in range(1, lag + 1):
-        pairs = (data.steps.toss[k:] == data.steps.toss[:-k])[:, None]
+        pairs = (toss[k:] == toss[:-k])[:, None]
         cross = (centered[k:] * pairs).T @ centered[:-k]
         G += (1 - k / (lag + 1)) * (cross + cross.T)
     G = G / n**2
     values, vectors = np.linalg.eigh(H)
-    H = vectors @ np.diag(np.maximum(values, 1e-9 * values.max())) @ vectors.T
-    G = G + 1e-12 * np.trace(G) * np.eye(4)
-    information = H @ np.linalg.solve(G, H)
+    H = vectors @ np.diag(np.maximum(values, 1e-9 * max(values.max(), 0.0))) @ vectors.T
+    information = np.zeros((4, 4))  # where nothing touches, nothing depends on friction or size: the prior is left
+    if np.trace(G) > 0:
+        information = H @ np.linalg.solve(G + 1e-12 * np.trace(G) * np.eye(4), H)
     active = np.abs(gradient).sum(1) > 1e-3 * np.abs(gradient).sum(1).max()
     contacts = int((np.diff(active.astype(int), prepend=0) == 1).sum())
     return np.linalg.inv(information + np.diag(1 / prior**2)), float(max(contacts - 4, 2))

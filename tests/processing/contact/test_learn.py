@@ -6,7 +6,7 @@ import torch
 
 from processing.contact.learn.dissipation_weight import Candidate, choose
 from processing.contact.learn.fit import FRICTION, Fit, FitConfig, Model, fit
-from processing.contact.learn.intervals import Interval
+from processing.contact.learn.intervals import Interval, _sandwich
 from processing.contact.learn.learn import ContactConfig, learn_contact
 from processing.contact.learn.prepared import prepare, transitions
 from processing.contact.learn.prior import prior_from_shape, prior_from_size
@@ -92,6 +92,14 @@ def test_one_toss_has_wide_intervals_from_the_curvature(simulated_tosses, box_ph
     assert one.friction.low <= 0.25 <= one.friction.high
     for edge, true in zip(one.extents, TRUE_EDGES_M):
         assert edge.low <= true <= edge.high
+
+
+def test_where_nothing_depends_on_friction_and_size_the_prior_is_left():
+    """A hand pushed the object, which never reached the plane: no gradient, no curvature, and no information."""
+    n, prior = 40, np.array([0.7, 0.2, 0.3, 0.4])
+    covariance, freedom = _sandwich(np.zeros((4, 4)), np.zeros((n, 4)), np.zeros(n, dtype=int), 2, prior)
+    np.testing.assert_allclose(covariance, np.diag(prior**2))
+    assert freedom == 2.0
 
 
 def test_duplicates_count_once(simulated_tosses, box_physics):
