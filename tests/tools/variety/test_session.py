@@ -141,6 +141,15 @@ def test_a_session_that_cannot_be_made_is_a_row_with_its_reason_and_leaves_nothi
     json.dumps(row)
 
 
+def test_what_a_run_cost_is_what_its_stages_cost(tmp_path):
+    for stage, spent_s in (("track-1", 12.5), ("fuse-2", 3.25)):
+        (tmp_path / stage).mkdir()
+        (tmp_path / stage / "stage.json").write_text(json.dumps({"stage": stage, "cpu_seconds": spent_s}))
+    (tmp_path / "variants").mkdir()
+    assert bench().stage_cpu_s(tmp_path) == 15.75
+    assert bench().stage_cpu_s(tmp_path / "missing") == 0.0
+
+
 def test_a_case_is_found_by_its_name_and_nonsense_is_refused():
     program = bench()
     assert program.case_of("judge-007-1") == seeds.Case("judge", 7, 1)
