@@ -93,7 +93,7 @@ def _add_everyday(parser: argparse.ArgumentParser) -> None:
     )  # the process that records, of toss-record --live
     parser.add_argument("--live-pose", type=Path, help=argparse.SUPPRESS)  # its frames, of toss-record --live pose
     parser.add_argument(
-        "--table-from-depth", action="store_true", help="where the calibration lacks the table: take it from depth"
+        "--table-from-depth", action="store_true", help="table from depth: the calibration lacks it, or is wrong"
     )
     parser.add_argument("--jobs", metavar="N", type=int, help="stages at a time (cores, fewer where memory is short)")
     parser.add_argument(

@@ -12,7 +12,10 @@ from processing.config import Config
 from processing.engine.each import Engine
 from processing.run import CAMERA, MakeProgress, Run
 from processing.segment.background.static_scene import StaticScene
+from processing.segment.robot.of_session import Rig
+from processing.sensor.frames import corrected_depth
 from processing.sensor.table_plane import with_table_from_depth
+from processing.stages.recording.rig import refine_rig
 from processing.stages.recording.scene import learn_static_scene
 from processing.stages.recording.still import without_waiting
 from processing.store import Store
@@ -48,9 +51,12 @@ def start_run(
 
 
 def with_table(run: Run) -> Run:
-    """The same run with the table that the depth of the empty scene shows (`--table-from-depth`)."""
-    scene = StaticScene.read(learn_static_scene(run).folder)
-    calibration, found = with_table_from_depth(run.session.calibration, CAMERA, scene.depth_m)
+    """The same run with the table that the depth of the empty scene shows (`--table-from-depth`), in the metres in
+    which the object is tracked."""
+    scene = learn_static_scene(run)
+    reported_m, rig = StaticScene.read(scene.folder).depth_m, Rig.read(refine_rig(run, scene).folder)
+    metric_m = corrected_depth(reported_m, rig.depth_scale)
+    calibration, found = with_table_from_depth(run.session.calibration, CAMERA, metric_m)
     session = run.session.with_calibration(calibration)
     seen = f"the table is from depth ({100 * found['share']:.0f} % of it, spread {1e3 * found['spread_m']:.1f} mm)"
     notice = Notice("table", "low", seen, "gravity is taken to be its normal")

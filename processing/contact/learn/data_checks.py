@@ -306,7 +306,7 @@ def _causes(heights_m: Mapping[int, float]) -> str:
     """Why a resting object is not on the plane, the likeliest first: a wrong plane or size is off by as much in every
     toss, wrong poses are not."""
     poses = "the poses at rest (look at them with `toss-view`) or parts of the shape that were not seen"
-    plane = "the plane (`toss-calibrate table SESSION`) or the size of the shape"
+    plane = "the plane (`toss-calibrate table SESSION`, or by `--table-from-depth`) or the size of the shape"
     off = np.array(list(heights_m.values()))
     if len(off) < 2:
         return f"One toss cannot tell which is wrong: {poses}, or {plane}"
