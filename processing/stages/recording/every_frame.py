@@ -4,8 +4,10 @@ far depth's scale may carry them all."""
 from __future__ import annotations
 
 import shutil
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -50,8 +52,7 @@ def poses_in_every_frame(run: Run, toss: int, done: Done, scale_sigma: float) ->
         write_track(folder, scaled_by_chance(track, scale_sigma))
         return EveryFrameResult(len(track.status), count)
 
-    config = {"toss": toss, "scale_sigma": scale_sigma}
-    return run.store.run("every-frame", VERSION, config, inputs, EveryFrameResult, compute)
+    return _stage(run, {"toss": toss, "scale_sigma": scale_sigma}, inputs, compute)
 
 
 def masks_in_every_frame(run: Run, toss: int, done: Done) -> Done:
@@ -66,8 +67,11 @@ def masks_in_every_frame(run: Run, toss: int, done: Done) -> Done:
         _copy_robot(RobotMasks.of(done.folder, toss), folder / f"toss_{toss:02d}.robot", kept)
         return EveryFrameResult(len(kept.like), len(kept.positions))
 
-    inputs = {"thinned": done.key, "kept": kept.digest}
-    return run.store.run("every-frame", VERSION, {"toss": toss, "masks": True}, inputs, EveryFrameResult, compute)
+    return _stage(run, {"toss": toss, "masks": True}, {"thinned": done.key, "kept": kept.digest}, compute)
+
+
+def _stage(run: Run, config: Any, inputs: dict[str, str], compute: Callable[[Path], EveryFrameResult]) -> Done:
+    return run.store.run("every-frame", VERSION, config, inputs, EveryFrameResult, compute)
 
 
 def scaled_by_chance(track: ObjectTrack, sigma: float) -> ObjectTrack:
