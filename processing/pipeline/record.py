@@ -25,9 +25,9 @@ def write_record(
 ) -> VariantRecord:  # fmt: skip
     """variants/<name>.<scope>.json. A toss in `lost` has no pose; its shape is said to be that of the first toss."""
     tracks, shapes = {**last.tracks, **lost}, {**last.shapes, **dict.fromkeys(lost, last.shape)}
-    scale_sigma = posterior_sigma(rig.result.scale_sigma, run.config.rig.scale)
+    scale_sigma, first = posterior_sigma(rig.result.scale_sigma, run.config.rig.scale), min(last.tracks)
     tosses = tuple(
-        TossRecord(t, poses_in_every_frame(run, t, tracks[t], scale_sigma).name, shapes[t].name,
+        TossRecord(t, poses_in_every_frame(run, t, tracks[t], (first, tracks[first]), scale_sigma).name, shapes[t].name,
                    masks_in_every_frame(run, t, masks[t]).name)
         for t in run.recorded
     )  # fmt: skip

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from processing.segment.background.depth_scale import DepthScaleSettings, posterior_sigma
-from processing.stages.recording.every_frame import scaled_by_chance
+from processing.stages.recording.every_frame import defining_pose, scaled_by_chance
 from recordings.geometry import rotation_exp
 from recordings.tracks import ObjectTrack
 
@@ -33,7 +33,7 @@ def test_the_covariance_grows_by_the_error_that_a_wrong_scale_makes() -> None:
     seen[:, :3, 3] *= 1 + too_long
     in_first = seen @ np.linalg.inv(seen[0]) @ true.camera_from_object[0]  # in the true object's frame at frame 0
     error_m = in_first[:, :3, 3] - true.camera_from_object[:, :3, 3]
-    claimed = scaled_by_chance(replace(true, camera_from_object=seen), SIGMA)
+    claimed = scaled_by_chance(replace(true, camera_from_object=seen), seen[0], SIGMA)
     posed = np.flatnonzero(~true.lost)
     grown = claimed.covariance[posed] - true.covariance[posed]
     assert np.linalg.norm(error_m[posed], axis=1).max() > 0.01
@@ -46,11 +46,40 @@ def test_the_covariance_grows_by_the_error_that_a_wrong_scale_makes() -> None:
 
 def test_poses_and_lost_frames_stay_as_they_are() -> None:
     true = true_track()
-    claimed = scaled_by_chance(true, SIGMA)
+    claimed = scaled_by_chance(true, true.camera_from_object[0], SIGMA)
     np.testing.assert_array_equal(claimed.camera_from_object, true.camera_from_object)
     np.testing.assert_array_equal(claimed.covariance[7], true.covariance[7])
     nowhere = ObjectTrack.nowhere(0, "d455", true.time_ns)
-    assert scaled_by_chance(nowhere, SIGMA) is nowhere
+    np.testing.assert_array_equal(
+        scaled_by_chance(nowhere, defining_pose(nowhere, nowhere), SIGMA).covariance, nowhere.covariance
+    )
+
+
+def test_a_toss_in_the_frame_of_another_is_told_from_where_that_one_defined_it() -> None:
+    first, too_long = true_track(), 0.011
+    poses = first.camera_from_object[::-1].copy()
+    poses[:, :3, 3] += [0.15, -0.05, 0.2]
+    other = replace(first, toss=1, camera_from_object=poses, status=first.status[::-1])
+    seen_first, seen = first.camera_from_object.copy(), poses.copy()
+    for scaled in (seen_first, seen):
+        scaled[:, :3, 3] *= 1 + too_long
+    in_first = seen @ np.linalg.inv(seen_first[0]) @ first.camera_from_object[0]
+    error_m = (in_first - poses)[:, :3, 3]
+    defined = defining_pose(replace(other, camera_from_object=seen), replace(first, camera_from_object=seen_first))
+    claimed = scaled_by_chance(replace(other, camera_from_object=seen), defined, SIGMA * too_long / (1 + too_long))
+    posed = ~other.lost
+    assert np.linalg.norm(error_m[posed], axis=1).min() > 0.001  # in no frame is it where its own first pose has it
+    wanted = SIGMA**2 * error_m[posed, :, None] * error_m[posed, None, :]
+    np.testing.assert_allclose((claimed.covariance - other.covariance)[posed, 3:, 3:], wanted, atol=1e-12)
+
+
+def test_a_frame_of_its_own_is_defined_by_its_own_first_pose() -> None:
+    track = true_track()
+    alone = replace(track, object_frame="object_toss_01", camera_from_object=track.camera_from_object[::-1].copy(),
+                    status=track.status[::-1])  # fmt: skip
+    np.testing.assert_array_equal(defining_pose(alone, track), alone.camera_from_object[0])
+    np.testing.assert_array_equal(defining_pose(track, ObjectTrack.nowhere(0, "d455", track.time_ns)),
+                                  track.camera_from_object[0])  # fmt: skip
 
 
 def test_the_scales_deviation_is_the_posteriors() -> None:

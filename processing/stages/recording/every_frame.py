@@ -20,7 +20,7 @@ from recordings.results.folder import RobotMasks, read_masks, read_track, write_
 from recordings.results.track_notes import FIT, NOTES
 from recordings.tracks import ObjectTrack
 
-VERSION = 3
+VERSION = 4
 
 
 @dataclass(frozen=True)
@@ -31,14 +31,17 @@ class EveryFrameResult:
     worked_on: int
 
 
-def poses_in_every_frame(run: Run, toss: int, done: Done, scale_sigma: float) -> Done:
-    """A stage's track of one toss in every frame that was recorded; `scale_sigma`: standard deviation of depth's
-    scale. What the tracker noted of its frames goes with it where these are all frames."""
+def poses_in_every_frame(run: Run, toss: int, done: Done, first: tuple[int, Done], scale_sigma: float) -> Done:
+    """A stage's track of one toss in every frame that was recorded. `first`: the toss that comes first, and its track;
+    `scale_sigma`: standard deviation of depth's scale. What the tracker noted of its frames goes with it where these
+    are all frames."""
     kept = run.kept.get(toss)
     inputs = {f"track_{toss:02d}": done.key} if kept is None else {"thinned": done.key, "kept": kept.digest}
+    inputs |= {"first": first[1].key}
 
     def compute(folder: Path) -> EveryFrameResult:
         track = read_track(done.folder, toss)
+        defined = defining_pose(track, read_track(first[1].folder, first[0]))
         count = len(track.status)
         if kept is None:
             for noted in (FIT.format(toss), NOTES.format(toss)):
@@ -49,10 +52,10 @@ def poses_in_every_frame(run: Run, toss: int, done: Done, scale_sigma: float) ->
             status = tuple(track.status[i] for i in kept.like)
             poses, covariance = (x[kept.like] for x in (track.camera_from_object, track.covariance))
             track = replace(track, time_ns=times_ns, camera_from_object=poses, status=status, covariance=covariance)
-        write_track(folder, scaled_by_chance(track, scale_sigma))
+        write_track(folder, scaled_by_chance(track, defined, scale_sigma))
         return EveryFrameResult(len(track.status), count)
 
-    return _stage(run, {"toss": toss, "scale_sigma": scale_sigma}, inputs, compute)
+    return _stage(run, {"toss": toss, "first": first[0], "scale_sigma": scale_sigma}, inputs, compute)
 
 
 def masks_in_every_frame(run: Run, toss: int, done: Done) -> Done:
@@ -70,21 +73,31 @@ def masks_in_every_frame(run: Run, toss: int, done: Done) -> Done:
     return _stage(run, {"toss": toss, "masks": True}, {"thinned": done.key, "kept": kept.digest}, compute)
 
 
-def _stage(run: Run, config: Any, inputs: dict[str, str], compute: Callable[[Path], EveryFrameResult]) -> Done:
+def _stage(
+    run: Run, config: dict[str, Any], inputs: dict[str, str], compute: Callable[[Path], EveryFrameResult]
+) -> Done:
     return run.store.run("every-frame", VERSION, config, inputs, EveryFrameResult, compute)
 
 
-def scaled_by_chance(track: ObjectTrack, sigma: float) -> ObjectTrack:
+def defining_pose(track: ObjectTrack, first: ObjectTrack) -> Float[Array, "4 4"]:
+    """The pose in which a track's object frame was defined: the first one of the `first` toss, where both share a frame
+    and it has any, or else of the track itself; NaN where neither has one."""
+    for one in (first, track):
+        posed = np.flatnonzero(~one.lost)
+        if one.object_frame == track.object_frame and len(posed):
+            return one.camera_from_object[posed[0]]
+    return np.full((4, 4), np.nan)
+
+
+def scaled_by_chance(track: ObjectTrack, defined: Float[Array, "4 4"], sigma: float) -> ObjectTrack:
     """The track, its covariances with what depth's scale, known to `sigma` (standard deviation), adds to them.
 
-    A scale that is wrong by d moves every position p by d p. The object frame is where the first pose has it, which
-    takes the shift of that frame away from all others, in object axes: at pose (R, p) d (p - R R0^T p0) are left.
+    A scale that is wrong by d moves every position p by d p. The object frame is where the pose (R0, p0) that `defined`
+    it has it, which takes the shift there away from all others, in object axes: at (R, p) d (p - R R0^T p0) are left.
     """
-    posed = np.flatnonzero(~track.lost)
-    if len(posed) == 0:
-        return track
+    posed = ~track.lost
     R, p = track.camera_from_object[posed, :3, :3], track.camera_from_object[posed, :3, 3]
-    shift: Float[Array, "m 3"] = p - R @ (R[0].T @ p[0])
+    shift: Float[Array, "m 3"] = p - R @ (defined[:3, :3].T @ defined[:3, 3])
     covariance = track.covariance.copy()
     covariance[posed, 3:, 3:] += sigma**2 * shift[:, :, None] * shift[:, None, :]
     return replace(track, covariance=covariance)
