@@ -1,11 +1,12 @@
 """The intervals of contact learning: what the model leaves is fitted on one half of the bodies or tosses, and how often
 the intervals hold the truth is counted on the other half.
 
-python tools/bench_intervals.py [one] [fast] [slow]      # all by default
+python tools/bench_intervals.py [one] [fast] [slow] [few]      # all by default
 
 `one`: single real tosses (TOSSLAB_DATA/contactnets/tosses_processed), each recording once; numbers below 200 fit, the
 others judge. `fast` (148 Hz, bootstrap) and `slow` (30 Hz, forecasts): simulated bodies of any kind; every second four
-of them fit. One thread; `one` takes 200 CPU seconds, the others up to half a minute a body.
+of them fit. `few`: the same at 30 Hz from one and two tosses, by forecasts and by the loss. One thread; `one` takes 200
+CPU seconds, the others up to half a minute a body.
 """
 
 from __future__ import annotations
@@ -21,8 +22,9 @@ from bench_contact import CUBE, any_body, held, line, noisy, recorded_once, run_
 from processing.contact.friction import estimate as slow_friction
 from processing.contact.learn import intervals
 from processing.contact.learn.learn import ContactConfig, ContactLearning, learn_contact
-from processing.contact.learn.prior import prior_from_size
-from processing.contact.physics.inertia import uniform_physics
+from processing.contact.learn.prior import Prior, prior_from_size
+from processing.contact.physics.inertia import Physics, uniform_physics
+from processing.motion.trajectory import PoseSeries
 from recordings.errors import BadInput
 from recordings.tracks import ObjectShape
 
@@ -91,9 +93,26 @@ def one() -> None:
     told("one toss, edges", edges[True], edges[False], intervals.MODEL_SIZE)
 
 
-def learned_body(seed: int, every: int) -> tuple[ContactLearning, float, float]:
-    """A simulated body of any kind learned from ten tosses at 148 Hz / every, its true friction and its restitution (of
-    a mass on a damped spring: exp(-pi d / sqrt(1 - d^2)))."""
+@dataclass(frozen=True, eq=False)
+class MadeBody:
+    """A simulated body of any kind, ten tosses of it, its true friction, and its restitution (of a mass on a damped
+    spring: exp(-pi d / sqrt(1 - d^2)))."""
+
+    what: str
+    tracks: list[PoseSeries]
+    prior: Prior
+    physics: Physics
+    friction: float
+    restitution: float
+
+    def learned(self, tosses: Sequence[int] = range(10), every: int = 5, forecasts: bool = True) -> ContactLearning:
+        repeats, penetration = 12 if every == 1 else 2, 1.0 if self.what.startswith("box") else 20.0
+        config = ContactConfig(bootstrap_repeats=repeats, penetration=penetration, friction_by_forecasts=forecasts)
+        return learn_contact([self.tracks[t] for t in tosses], self.prior, self.physics, config=config)
+
+
+def made_body(seed: int, every: int) -> MadeBody:
+    """At 148 Hz / every."""
     rng = np.random.default_rng([77, seed])
     kind, mu = ("box", "box", "prism", "L-shape")[seed % 4], float(rng.uniform(0.1, 0.5))
     damping, soft_s = (1.0, 1.0, 0.5, 0.25)[rng.integers(4)], float(np.exp(rng.uniform(*np.log([0.0015, 0.006]))))
@@ -104,17 +123,51 @@ def learned_body(seed: int, every: int) -> tuple[ContactLearning, float, float]:
     made = simulated(pieces, physics, mu, 10, seed, soft_s, damping)
     tracks = [noisy(t, every, 1e-3 * mm_noise, np.radians(0.5 * mm_noise), seed) for t in made]
     prior = prior_from_size("box", 0.05) if kind == "box" else held(shape, physics, rng)
-    config = ContactConfig(bootstrap_repeats=12 if every == 1 else 2, penetration=1.0 if kind == "box" else 20.0)
+    rebound = 0.0 if damping == 1 else float(np.exp(-np.pi * damping / (1 - damping**2) ** 0.5))
+    what = f"{kind}, rebound damping {damping:g}, {1e3 * soft_s:.1f} ms, noise {mm_noise:g} mm"
+    return MadeBody(what, tracks, prior, physics, mu, rebound)
+
+
+def learned_body(seed: int, every: int) -> tuple[ContactLearning, float, float]:
+    """A simulated body learned from ten tosses, its true friction and its restitution."""
+    body = made_body(seed, every)
     began = time.process_time()
-    found = learn_contact(tracks, prior, physics, config=config)
-    f, rebound = found.friction, 0.0 if damping == 1 else float(np.exp(-np.pi * damping / (1 - damping**2) ** 0.5))
-    law = "" if found.restitution is None else f"; restitution {found.restitution.value:.2f}, true {rebound:.2f}"
+    found = body.learned(every=every)
+    f = found.friction
+    law = (
+        "" if found.restitution is None else f"; restitution {found.restitution.value:.2f}, true {body.restitution:.2f}"
+    )
     line(
         f"body {seed}",
-        f"{kind}, rebound damping {damping:g}, {1e3 * soft_s:.1f} ms, noise {mm_noise:g} mm: friction {f.value:.3f} "
-        f"({f.low:.3f} .. {f.high:.3f}), true {mu:.3f}{law}; {time.process_time() - began:.1f} CPU-s",
+        f"{body.what}: friction {f.value:.3f} ({f.low:.3f} .. {f.high:.3f}), true {body.friction:.3f}{law}; "
+        f"{time.process_time() - began:.1f} CPU-s",
     )
-    return found, mu, rebound
+    return found, body.friction, body.restitution
+
+
+def few() -> None:
+    """Friction at 30 Hz from one and two tosses, by forecasts and by the loss."""
+    ratios: dict[tuple[int, bool], list[float]] = {}
+    held_by: dict[tuple[int, bool], list[bool]] = {}
+    for seed in range(BODIES):
+        body = made_body(seed, 5)
+        for tosses in ((0,), (1,), (2,), (3, 4), (5, 6)):
+            for forecasts in (True, False):
+                try:
+                    f = body.learned(tosses, forecasts=forecasts).friction
+                except BadInput:  # a box whose size one toss does not tell
+                    continue
+                of = (len(tosses), forecasts)
+                ratios.setdefault(of, []).append(max(f.value, 0.01) / body.friction)
+                held_by.setdefault(of, []).append(f.low <= body.friction <= f.high)
+    for (tosses, forecasts), found in sorted(ratios.items()):
+        off, inside = np.abs(1 / np.array(found) - 1), np.mean(held_by[tosses, forecasts])
+        line(
+            f"{tosses} tosses, {'forecasts' if forecasts else 'loss'}",
+            f"{len(found)} fits: median of estimate / truth {np.median(found):.2f}, rms of its log "
+            f"{np.sqrt(np.mean(np.log(found) ** 2)):.2f}; 95 % of |truth / estimate - 1| below "
+            f"{np.quantile(off, 0.95, method='higher'):.2f}; inside the interval {100 * inside:.0f} %",
+        )
 
 
 def bodies(every: int) -> None:
@@ -141,8 +194,8 @@ def bodies(every: int) -> None:
         told(f"{name}, restitution", rebounds[True], rebounds[False], slow_friction.MODEL_RESTITUTION)
 
 
-CASES = {"one": one, "fast": lambda: bodies(1), "slow": lambda: bodies(5)}
+CASES = {"one": one, "fast": lambda: bodies(1), "slow": lambda: bodies(5), "few": few}
 
 
 if __name__ == "__main__":
-    sys.exit(run_cases(CASES, without_data=("fast", "slow")))
+    sys.exit(run_cases(CASES, without_data=("fast", "slow", "few")))

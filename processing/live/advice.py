@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray as Array
 
-from processing.contact.friction.estimate import LEAST_TOSSES
+from processing.contact.friction.estimate import ENOUGH_TOSSES
 from processing.live.friction import LawSoFar, shrink_by
 from processing.live.sides import Start, TossSides, next_starts, surface_sigma_m
 from recordings.geometry import Transform
@@ -93,9 +93,9 @@ def _differs(toss: int, throws: Mapping[int, Throw]) -> str:
 
 
 def _until_friction(throws: Mapping[int, Throw]) -> list[Option]:
-    missing = LEAST_TOSSES - len(throws)
+    missing = ENOUGH_TOSSES - len(throws)
     if missing <= 0:
         return []
-    need = f"friction cannot be told from fewer than {LEAST_TOSSES}"
+    need = f"fewer than {ENOUGH_TOSSES} hardly tell friction"
     text = f"{missing} more that fly, hit the table and come to rest: {need}"
     return [Option(text, 0.0)]

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from processing.contact.friction.estimate import (
+    ENOUGH_TOSSES,
     PROFILE,
     RESTITUTION_ASSUMED,
     friction_by_forecasts,
@@ -59,7 +60,7 @@ def law_so_far(
     """From tracks in the shape's object frame; None where too few of them hit the table."""
     body, series, smoothed = _prepared(tracks, shape, world_from_camera, calibration)
     hit = [s.toss for s, m in zip(series, smoothed) if observed_trajectories([s], [m])]
-    found = friction_by_forecasts(body, series, smoothed)
+    found = friction_by_forecasts(body, series, smoothed) if len(hit) >= ENOUGH_TOSSES else None
     if found is None:
         return None
     step = float(PROFILE[1] - PROFILE[0])

@@ -238,7 +238,7 @@ def _fused(
     begin = np.append(points.ravel() / SCALE_M, learning.fit.parameters[FRICTION])
     found = fit_lbfgs(model, begin, learning.data, learning.weights, 20)
     slow = slow_friction(model, found.parameters, learning.prepared, contact_config)
-    found, spread = with_friction(found, learning.spread, slow)
+    found, spread = with_friction(found, learning.spread, slow, learning.prepared, contact_config)
     moved = replace(prior, geometry=model.geometry)
     contact, _, friction, sizes = results_of(model, found.parameters, spread, moved, physics, plane, learning.touched)
     return replace(

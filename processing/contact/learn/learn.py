@@ -30,6 +30,10 @@ from processing.motion.trajectory import PoseSeries, Steps
 from recordings.progress import Progress, Silent
 from recordings.tracks import ContactModel, ObjectShape
 
+LOSS_WHEN_SLOW = 0.35
+"""Half the 95 % interval of the loss's friction where frames are too far apart for it: the 95 % quantile of its error
+in 85 single tosses of simulated bodies (tools/bench_intervals.py few)."""
+
 
 @dataclass(frozen=True)
 class ContactConfig:
@@ -141,7 +145,7 @@ def learn_contact(
     progress.step(4, 6, "intervals")
     sensitivity = plane_sensitivity(fitted, optimum, data, weights)
     progress.step(5, 6, "sensitivity")
-    last, spread = with_friction(fits[-1], spread, slow)
+    last, spread = with_friction(fits[-1], spread, slow, prepared, config)
     optimum = last.parameters
     body = fitted.numbers(optimum)
     touched = touched_points(fitted, body, data, weights)
@@ -241,11 +245,16 @@ def _choose_weights(
     return sweep, Weights(dissipation=sweep.chosen.dissipation, penetration=config.penetration)
 
 
+def forecasts_are_wanted(prepared: Prepared, config: ContactConfig) -> bool:
+    """Whether friction is to be found by forecasts, because frames are too far apart for the loss."""
+    return config.weights is None and config.friction_by_forecasts and frames_are_slow(prepared.tracks)
+
+
 def slow_friction(
     fitted: Model, optimum: Float[Array, " p"], prepared: Prepared, config: ContactConfig
 ) -> ForecastFriction | None:
     """The friction by forecasts where it is better than the loss's; None where it is not, or not asked for."""
-    if config.weights is not None or not config.friction_by_forecasts or not frames_are_slow(prepared.tracks):
+    if not forecasts_are_wanted(prepared, config):
         return None
     return friction_by_forecasts(_as_rigid(fitted, optimum), prepared.tracks, prepared.smoothed, config.seed)
 
@@ -283,10 +292,14 @@ def _slow_plane(
     return {"plane_by_touch_m": plane.height_m, "plane_by_touch_std_m": plane.std_m}
 
 
-def with_friction(done: Fit, spread: Spread, slow: ForecastFriction | None) -> tuple[Fit, Spread]:
-    """A fit and its intervals with the friction by forecasts, where there is one."""
+def with_friction(
+    done: Fit, spread: Spread, slow: ForecastFriction | None, prepared: Prepared, config: ContactConfig
+) -> tuple[Fit, Spread]:
+    """A fit and its intervals with the friction by forecasts, where there is one. Where it was wanted and no toss flies
+    and hits the plane, the loss's friction stays, and may be far off."""
     if slow is None:
-        return done, spread
+        wanted = forecasts_are_wanted(prepared, config)
+        return done, replace(spread, friction=max(spread.friction, LOSS_WHEN_SLOW)) if wanted else spread
     parameters = done.parameters.copy()
     parameters[FRICTION] = slow.value**0.5
     method = f"{spread.method}; friction by forecasts"

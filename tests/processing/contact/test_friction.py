@@ -4,7 +4,7 @@ import numba
 import numpy as np
 import pytest
 
-from processing.contact.friction.estimate import best_law, frames_are_slow, friction_by_forecasts
+from processing.contact.friction.estimate import FEW_TOSSES, best_law, frames_are_slow, friction_by_forecasts
 from processing.contact.friction.forecast import MEMBERS, Forecasts, Law, ObservedTrajectory, RigidBody
 from processing.contact.learn.prepared import prepare
 from processing.contact.learn.prior import prior_from_size
@@ -99,8 +99,19 @@ def test_the_search_follows_a_valley_in_which_friction_trades_for_restitution(sl
     assert best_law(Valley(slope)).friction == pytest.approx(0.2, rel=0.15)
 
 
-def test_two_tosses_are_too_few(simulated_tosses, rigid_box, box_physics):
-    assert found_at(simulated_tosses(2), rigid_box, box_physics) is None
+@pytest.mark.parametrize("count", [1, 2])
+def test_few_tosses_tell_friction_as_coarsely_as_they_do_on_other_bodies(
+    simulated_tosses, rigid_box, box_physics, count
+):
+    found = found_at([t.part(slice(0, None, 5)) for t in simulated_tosses(count)], rigid_box, box_physics)
+    share, rebound = FEW_TOSSES[count]
+    assert (found.half_width, found.restitution_half_width) == (pytest.approx(share * found.value), rebound)
+    assert abs(found.value - BOX_FRICTION) < 0.5 * BOX_FRICTION
+
+
+def test_a_toss_that_never_hits_tells_no_friction(simulated_tosses, rigid_box, box_physics):
+    flight = [t.part(slice(0, 8)) for t in simulated_tosses(1)]
+    assert found_at(flight, rigid_box, box_physics) is None
 
 
 def test_a_cameras_frames_are_slow_and_a_motion_capture_systems_are_not(simulated_tosses):
