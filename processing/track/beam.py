@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Int64
 from numpy import ndarray as Array
 
-from processing.features.sift import FeatureMatcher, Features, RansacConfig, relative_motions
+from processing.features.sift import FeatureMatcher, Features, RansacConfig, RelativeMotion, relative_motions
 from processing.motion import se3_kernels as se3
 from processing.motion.interpolate import carried_on, moved, turn_between
 from processing.motion.motion_prior import MotionConfig, change_cost, steady_spin
@@ -79,6 +79,7 @@ class Scene:
     center_m: Float[Array, "3"]
     matcher: FeatureMatcher
     features: dict[int, Features] = field(default_factory=dict)
+    matched: dict[tuple[int, int], list[RelativeMotion]] = field(default_factory=dict)
     flying: Bool[Array, " n"] | None = None
     """Frames in which nothing touches the body (processing/track/flight.py); None: not known of any."""
     hand: Float[Array, "n 4 4"] | None = None
@@ -98,6 +99,13 @@ class Scene:
         if view not in self.features:
             self.features[view] = self.matcher.describe(self.store, view)
         return self.features[view]
+
+    def motions(self, one: int, other: int, ransac: RansacConfig) -> list[RelativeMotion]:
+        """Between two views, as their features say: the same for every hypothesis."""
+        if (one, other) not in self.matched:
+            both = self.described(one), self.described(other)
+            self.matched[one, other] = relative_motions(self.matcher, *both, ransac, seed=other, most=2)
+        return self.matched[one, other]
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,23 +141,15 @@ class Candidate:
         return self.fit + self.motion_cost
 
 
-@dataclass(frozen=True, eq=False)
-class Followed:
-    """The beam's answer: the best hypothesis, how far behind the next different one ended, and what was rejected."""
-
-    best: Hypothesis
-    margin: float
-    rejected: dict[int, list[Candidate]]
-
-
 def follow(
     scene: Scene,
     order: Int[Array, " m"],
     beam: list[Hypothesis],
     config: BeamConfig,
     on_step: object = None,
-) -> Followed:
-    """Track the views in `order` (forward or backward in time) from what the hypotheses in `beam` already hold."""
+) -> tuple[Hypothesis, dict[int, list[Candidate]]]:
+    """Track the views in `order` (forward or backward in time) from what the hypotheses in `beam` already hold. The
+    best hypothesis, and the candidates that were rejected."""
     rejected: dict[int, list[Candidate]] = {}
     for i in order:
         i = int(i)
@@ -165,8 +165,7 @@ def follow(
         beam = _pruned(grown, i, config)
         if callable(on_step):
             on_step(i, beam)
-    margin = beam[1].total - beam[0].total if len(beam) > 1 else np.inf
-    return Followed(beam[0], float(margin), rejected)
+    return beam[0], rejected
 
 
 def _put_at_color_time(scene: Scene, h: Hypothesis, i: int, config: BeamConfig) -> None:
@@ -275,10 +274,9 @@ def _usual_starts(scene: Scene, h: Hypothesis, i: int) -> list[tuple[str, Float[
 
 def _feature_starts(scene: Scene, h: Hypothesis, i: int, config: BeamConfig) -> list[tuple[str, Float[Array, "4 4"]]]:
     """Poses that feature matches to the last view and to the keyframes support."""
-    here = scene.described(i)
     starts = []
     for j in dict.fromkeys((h.tracked[-1], *(j for j in reversed(h.keyframes[-8:]) if j != i))):
-        for motion in relative_motions(scene.matcher, scene.described(j), here, config.ransac, seed=i, most=2):
+        for motion in scene.motions(j, i, config.ransac):
             starts.append((f"features of {j}", motion.other_from_one @ h.poses[j]))
     return starts[:8]
 

@@ -222,7 +222,6 @@ def _followed(scene: Scene, flight: Flight, first: int, beam: BeamConfig) -> Hyp
     poses[flight.frames], costs[flight.frames], on[flight.frames] = flight.poses, flight.cost, 1.0
     keys = extended(frames[:1], poses, frames, scene.center_m, beam.keyframes)
     h = Hypothesis(poses, costs, on, frames[::-1], keys, 0.0)
-    h = follow(scene, np.arange(frames[0] - 1, first - 1, -1), [h], beam).best
-    return follow(
-        scene, np.arange(frames[-1] + 1, n), [replace(h, done=tuple(range(first, frames[-1] + 1)))], beam
-    ).best
+    h, _ = follow(scene, np.arange(frames[0] - 1, first - 1, -1), [h], beam)
+    ahead = replace(h, done=tuple(range(first, frames[-1] + 1)))
+    return follow(scene, np.arange(frames[-1] + 1, n), [ahead], beam)[0]

@@ -32,7 +32,6 @@ def write_toss_track(folder: Path, tracked: TossTrack) -> None:
             keyframes=np.array(tracked.keyframes, dtype=np.int64),
             pairs=tracked.pairs,
             center_m=tracked.center_m,
-            margin=np.array(tracked.margin),
             round_body=np.array(tracked.round_body),
             held=tracked.held,
         )
@@ -61,7 +60,6 @@ def read_toss_track(
             pairs=stored["pairs"],
             rejected={},
             center_m=stored["center_m"],
-            margin=float(stored["margin"]),
             store=store,
             features={},
             round_body=bool(stored["round_body"]),

@@ -84,8 +84,6 @@ class TossTrack:
     pairs: Int[Array, "m 2"]
     rejected: dict[int, list[Candidate]]
     center_m: Float[Array, "3"]
-    margin: float
-    """How much more the best different hypothesis costs (infinite: there is none)."""
     store: ViewStore
     features: dict[int, Features]
     held: Int[Array, " n"]
@@ -157,9 +155,9 @@ def track_toss(
     n = len(frames)
     scene = replace(scene, flying=np.isin(np.arange(n), flying(scene, n, config.flight)))
     if known.poses is None:
-        hypotheses, margin, rejected = _followed(scene, first, known, config, progress)
+        hypotheses, rejected = _followed(scene, first, known, config, progress)
     else:
-        hypothesis, margin, rejected = _filled_in(scene, known, config, progress)
+        hypothesis, rejected = _filled_in(scene, known, config, progress)
         hypotheses = [hypothesis]
     keep_first = model is None or known.start is not None
     found = all_refined(scene, hypotheses, first, keep_first, config.hypotheses)
@@ -169,7 +167,7 @@ def track_toss(
     )  # fmt: skip
     joint = select(scene, found, first, keep_first, known.poses is None, config.hypotheses)
     object_frame = object_frame if model is None else model.object_frame
-    return _as_track(scene, joint, first, margin, rejected, config, toss, camera.frame, object_frame, times_ns)
+    return _as_track(scene, joint, first, rejected, config, toss, camera.frame, object_frame, times_ns)
 
 
 def _known(
@@ -261,25 +259,21 @@ def _first_center_m(store: ViewStore, view: int, known: _Known) -> Float[Array, 
 
 def _followed(
     scene: Scene, first: int, known: _Known, config: TrackConfig, progress: Progress
-) -> tuple[list[Hypothesis], float, dict[int, list[Candidate]]]:
+) -> tuple[list[Hypothesis], dict[int, list[Candidate]]]:
     """Hypotheses of the same frames: the beam forward, then once more backward to the first frame with all that forward
     learned as the model; a beam backward that knows nothing of that but where the last frame is; and the beam forward
     itself, where both differ from it. Where they leave its flight open, that solved as one adds its own."""
     n = len(scene.times_s)
-
-    def report(i: int, beam: list[Hypothesis]) -> None:
-        progress.step(n + i, 3 * n, "forward")
-
     beam, wide = _starts(scene, first, known, config)
-    ahead = follow(scene, np.arange(first + 1, n), beam, wide, report)
-    best = ahead.best
+    ahead = np.arange(first + 1, n)
+    best, rejected = follow(scene, ahead, beam, wide, lambda i, _: progress.step(n + i, 3 * n, "forward"))
     last = best.tracked[-1]
     all_done = replace(best, done=(last,), total=0.0)
     stop = first if known.model is not None and known.start is not None else first - 1
     narrow, starts = replace(config.beam, width=2), [all_done]
     if known.model is None and last > first + 1:
         starts.append(started(scene.store, n, last, best.poses[last]))
-    hypotheses = [follow(scene, np.arange(last - 1, stop, -1), [h], narrow).best for h in starts]
+    hypotheses = [follow(scene, np.arange(last - 1, stop, -1), [h], narrow)[0] for h in starts]
     if known.model is None:
         hypotheses = [anchored_to(h, best, first) for h in hypotheses]
     if len(starts) > 1:
@@ -290,9 +284,9 @@ def _followed(
     for hypothesis in hypotheses:
         if any(scene.store.usable(i) for i in range(first)):
             done = (*(i for i in hypothesis.done if i != first), first)
-            hypothesis = follow(scene, np.arange(first - 1, -1, -1), [replace(hypothesis, done=done)], narrow).best
+            hypothesis = follow(scene, np.arange(first - 1, -1, -1), [replace(hypothesis, done=done)], narrow)[0]
         out.append(replace(hypothesis, done=tuple(range(n)), total=best.total))
-    return out, ahead.margin, ahead.rejected
+    return out, rejected
 
 
 def _through_flights(
@@ -329,7 +323,7 @@ def _starts(scene: Scene, first: int, known: _Known, config: TrackConfig) -> tup
 
 def _filled_in(
     scene: Scene, known: _Known, config: TrackConfig, progress: Progress
-) -> tuple[Hypothesis, float, dict[int, list[Candidate]]]:
+) -> tuple[Hypothesis, dict[int, list[Candidate]]]:
     """The given poses as one hypothesis; usable frames without one are sought from the known frames around them."""
     assert known.poses is not None
     n = len(scene.times_s)
@@ -346,14 +340,14 @@ def _filled_in(
             continue
         posed = np.flatnonzero(np.isfinite(h.poses[:n, 0, 0]))
         around = posed[posed < i] if (posed < i).any() else posed[::-1]
-        found = follow(scene, np.array([i]), [replace(h, done=tuple(int(j) for j in around))], config.beam)
-        h, rejected = found.best, {**rejected, **found.rejected}
+        h, of_this = follow(scene, np.array([i]), [replace(h, done=tuple(int(j) for j in around))], config.beam)
+        rejected |= of_this
         progress.step(n + i, 3 * n, "frames without a pose")
-    return replace(h, done=tuple(range(n))), np.inf, rejected
+    return replace(h, done=tuple(range(n))), rejected
 
 
 def _as_track(
-    scene: Scene, hypotheses: list[TrajectoryHypothesis], first: int, margin: float,
+    scene: Scene, hypotheses: list[TrajectoryHypothesis], first: int,
     rejected: dict[int, list[Candidate]], config: TrackConfig, toss: int, camera: str, object_frame: str,
     times_ns: Int64[Array, " n"],
 ) -> TossTrack:  # fmt: skip
@@ -370,8 +364,6 @@ def _as_track(
     for other in hypotheses[1:]:
         apart = other.total - best.total
         twists = twists + uncertainty(joint.poses[:n], other.joint.poses[:n], apart, config.flags)
-        if apart_deg(joint.poses[:n], other.joint.poses[:n]) > config.hypotheses.agreeing_deg:
-            margin = min(margin, apart)
     twists = twists + unknown_motion(scene, joint.poses[:n], best.use)
     hanging = unjoined(joint.pairs, joint.figures, (first, *range(n, len(scene.store))), best.use & ~lost, config.flags)
     slipped = contradicting(
@@ -382,5 +374,5 @@ def _as_track(
     track = ObjectTrack(toss, camera, object_frame, times_ns, poses, status, covariance)
     keyframes = tuple(i for i in sorted(best.estimated.keyframes) if i < n and not lost[i])
     pairs = joint.pairs[(joint.pairs < n).all(1)]
-    return TossTrack(track, cost, on, keyframes, pairs, rejected, best.center_m, margin, scene.store,
+    return TossTrack(track, cost, on, keyframes, pairs, rejected, best.center_m, scene.store,
                      scene.features, best.held, best.axis is not None)  # fmt: skip

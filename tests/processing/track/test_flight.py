@@ -12,7 +12,7 @@ from processing.features.sift import Sift
 from processing.motion.motion_prior import MotionConfig, change_cost, gravity_in_camera
 from processing.motion.rotation_grid import ball
 from processing.sensor import view_layout as lay
-from processing.track.beam import Followed, Hypothesis, Scene, seconds
+from processing.track.beam import Hypothesis, Scene, seconds
 from processing.track.flight import FlightConfig, flights_followed, flying, solved
 from processing.track.flight_kernels import UNKNOWNS, _place
 from processing.track.track_toss import TrackConfig, _followed, _Known, first_pose, started, views_of
@@ -132,10 +132,10 @@ def test_where_the_way_back_slid_away_the_first_frame_goes_with_it(scene: Scene,
     n, slid = len(scene.times_s), Transform("a", "b", rotation_exp(np.array([0.0, 0.0, 2.0])), np.zeros(3)).matrix
     true = np.array([thrown(i).matrix for i in range(n)])
 
-    def followed(_: Scene, order: Any, beam: list[Hypothesis], *unused: Any) -> Followed:
+    def followed(_: Scene, order: Any, beam: list[Hypothesis], *unused: Any) -> tuple[Hypothesis, dict[int, Any]]:
         poses = beam[0].poses.copy()
         poses[order] = true[order] if order[0] < order[-1] else true[order] @ slid
-        return Followed(replace(beam[0], poses=poses, done=(*beam[0].done, *map(int, order))), 0.0, {})
+        return replace(beam[0], poses=poses, done=(*beam[0].done, *map(int, order))), {}
 
     monkeypatch.setattr("processing.track.track_toss.follow", followed)
     known = _Known(true[0], 0, None, None)

@@ -199,7 +199,7 @@ def tracked(store: ViewStore, second: np.ndarray) -> TossTrack:
     track = ObjectTrack(0, "d455", "object", np.arange(3), poses, status, np.full((3, 6, 6), np.nan))
     tried = [Candidate(POSES[0], fit, 0.0, 1.0, "prior") for fit in (0.5, 0.3, 0.4)]
     figures = np.array([0.1, 0.1, np.nan])
-    return TossTrack(track, figures, figures, (0,), np.array([[0, 1]]), {1: tried}, np.zeros(3), 1.0, store,
+    return TossTrack(track, figures, figures, (0,), np.array([[0, 1]]), {1: tried}, np.zeros(3), store,
                      {i: Sift().describe(store, i) for i in range(2)}, np.full(len(figures), -1))  # fmt: skip
 
 
