@@ -107,6 +107,12 @@ class Scene:
             self.matched[one, other] = relative_motions(self.matcher, *both, ransac, seed=other, most=2)
         return self.matched[one, other]
 
+    def forget(self, view: int) -> None:
+        """What was found of a view, whose place another one takes."""
+        self.features.pop(view, None)
+        for pair in [p for p in self.matched if view in p]:
+            del self.matched[pair]
+
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
@@ -142,11 +148,7 @@ class Candidate:
 
 
 def follow(
-    scene: Scene,
-    order: Int[Array, " m"],
-    beam: list[Hypothesis],
-    config: BeamConfig,
-    on_step: object = None,
+    scene: Scene, order: Int[Array, " m"], beam: list[Hypothesis], config: BeamConfig, on_step: object = None
 ) -> tuple[Hypothesis, dict[int, list[Candidate]]]:
     """Track the views in `order` (forward or backward in time) from what the hypotheses in `beam` already hold. The
     best hypothesis, and the candidates that were rejected."""

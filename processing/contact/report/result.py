@@ -89,7 +89,7 @@ def warnings_of(learning: ContactLearning) -> list[Notice]:
     if (plane := plane_warning(*(learning.checks.get(f"plane_by_touch{n}_m") for n in ("", "_std")))) is not None:
         found.append(Notice("contact", "high", plane, sure="likely"))
     if len(learning.tosses) == 1:
-        seen = "contact was learned from one toss only: its intervals come from that toss alone, and are wide"
+        seen = "contact was learned from one toss only: its intervals are wide"
         found.append(Notice("contact", "low", seen, "record more tosses"))
     return found
 

@@ -123,7 +123,7 @@ class PoseFront:
         slot = self._slot
         self._scene.store.crops[slot] = replace(crop, position=slot)
         self._scene.times_s[slot] = time_s
-        self._scene.features.pop(slot, None)
+        self._scene.forget(slot)
         if not self._scene.store.fill(slot):
             return self._missed(frame)
         if not self._beam:

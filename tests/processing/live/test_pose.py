@@ -63,6 +63,21 @@ def test_a_thrown_box_is_followed_and_found_again_after_it_was_hidden(tiny_world
     assert off_mm(again, true[12]) < 8.0
 
 
+def test_what_features_said_of_a_frame_is_forgotten_with_it(tiny_world, shape, flight) -> None:  # type: ignore[no-untyped-def]
+    """Frames take each other's places in the store: motions of the one before would be those of another picture."""
+    frames, _, background = flight
+    front = PoseFront(tiny_world.camera, shape, background, tiny_world.world_from_camera)
+    front.see(frames[0])
+    now, taken = front._slot, front._slot + 1
+    stale = {(now, taken): [], (taken, now): []}
+    front._scene.matched.update({**stale, (now, now): []})
+    front._scene.features[taken] = front._scene.described(now)
+    front.see(frames[1])
+    assert all(front._scene.matched.get(pair) is not kept for pair, kept in stale.items())
+    assert (now, now) in front._scene.matched
+    assert front._scene.features.get(taken) is not front._scene.features[now]
+
+
 def test_a_pose_comes_back_from_its_line_and_its_file(tiny_world, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
     pose = np.eye(4)
     pose[:3, 3] = (0.1, 0.2, 0.7)
