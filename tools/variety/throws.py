@@ -257,7 +257,7 @@ def _passing(eye_m: Float[Array, "3"], middle_s: float, rng: np.random.Generator
     """Something crosses the line of sight in mid-flight."""
     side = _unit(np.cross(eye_m, [0.0, 0.0, 1.0])) * rng.choice([-1, 1])
     middle = rng.uniform(0.35, 0.5) * eye_m + [0, 0, 0.05]
-    axes = np.stack([np.cross(side, [0.0, 0.0, 1.0]), [0.0, 0.0, 1.0], side], 1)
+    axes = np.stack([np.cross([0.0, 0.0, 1.0], side), [0.0, 0.0, 1.0], side], 1)
     speed = rng.uniform(0.8, 1.6)
 
     def place(time_s: float) -> Transform | None:

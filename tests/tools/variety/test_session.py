@@ -46,6 +46,21 @@ def textured_cube(folder, scale=1.0, texture=True, open_=False):
     return folder / "cube.obj"
 
 
+def test_what_crosses_the_line_of_sight_does_so_in_mid_flight() -> None:
+    for seed in range(8):
+        eye_m = np.array([0.6, -0.3, 0.8])
+        at = throws._passing(eye_m, 1.0, np.random.default_rng(seed))
+        before, middle, after = (at(t) for t in (0.8, 1.0, 1.2))
+        assert before is not None
+        assert middle is not None
+        assert after is not None
+        way = after.translation_m - before.translation_m
+        assert abs(way @ eye_m) < 1e-9
+        assert 0.3 < np.linalg.norm(way) < 0.7
+        assert np.linalg.norm(np.cross(middle.translation_m - [0, 0, 0.05], eye_m)) < 1e-9  # between eye and table
+        assert at(1.4) is None
+
+
 def test_a_good_mesh_keeps_its_size_and_its_picture(tmp_path):
     mesh = read_textured(textured_cube(tmp_path))
     np.testing.assert_allclose(np.ptp(mesh.vertices_m, axis=0), 0.1, rtol=1e-6)
