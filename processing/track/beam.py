@@ -95,6 +95,10 @@ class Scene:
         """Whether the body flies in all these frames."""
         return self.flying is not None and bool(self.flying[list(frames)].all())
 
+    def held(self, frame: int) -> bool:
+        """Whether the body's flight is still to come."""
+        return self.flying is not None and bool(self.flying[frame:].any() and not self.flying[: frame + 1].any())
+
     def described(self, view: int) -> Features:
         if view not in self.features:
             self.features[view] = self.matcher.describe(self.store, view)
@@ -181,10 +185,10 @@ def _put_at_color_time(scene: Scene, h: Hypothesis, i: int, config: BeamConfig) 
     # over three poses, not two: an error of the last pose must not move the depth that the next one rests on
     a, b = tracked[max(-3, -len(tracked))], tracked[-1]
     step_s = scene.times_s[b] - scene.times_s[a]
-    recent = list(tracked[-6:])
-    spin = steady_spin(h.poses[recent], scene.times_s[recent])
+    spin = steady_spin(h.poses[tracked[-6:]], scene.times_s[tracked[-6:]])
+    gravity = scene.gravity_camera_m_s2 * (not scene.held(i))
     color, depth = (
-        moved(h.poses[a], h.poses[b], step_s, t - scene.times_s[b], scene.center_m, scene.gravity_camera_m_s2, spin)
+        moved(h.poses[a], h.poses[b], step_s, t - scene.times_s[b], scene.center_m, gravity, spin)
         for t in (scene.times_s[i], scene.times_s[i] + crop.depth_delay_s)
     )
     scene.store.fill(i, color @ se3.inverse(depth))
@@ -297,8 +301,7 @@ def _searched(
             turned[:3, 3] = center - turned[:3, :3] @ scene.center_m
             tries.append(turned)
     tried = [_aligned(scene, h, i, t, config.grid, config, "grid") for t in tries]
-    rough = merged([c for c in tried if c is not None], config)[:8]
-    return _refined(scene, h, i, rough, config)
+    return _refined(scene, h, i, merged([c for c in tried if c is not None], config)[:8], config)
 
 
 def _aligned_all(
@@ -317,13 +320,10 @@ def _held(
     scene: Scene, h: Hypothesis, i: int, starts: list[tuple[str, Float[Array, "4 4"]]], config: BeamConfig
 ) -> list[Candidate]:
     """The predicted motion, moved only where images insist: a uniform body must not turn with its shading."""
-    found = []
-    for name, pose in starts:
-        if name == "prior":
-            coarse = _aligned(scene, h, i, pose, config.coarse, config, name, held=pose)
-            if coarse is not None:
-                found.append(_aligned(scene, h, i, coarse.pose, config.fine, config, "held", held=pose))
-    return [c for c in found if c is not None]
+    prior = next((pose for name, pose in starts if name == "prior"), None)
+    coarse = None if prior is None else _aligned(scene, h, i, prior, config.coarse, config, "prior", held=prior)
+    fine = None if coarse is None else _aligned(scene, h, i, coarse.pose, config.fine, config, "held", held=prior)
+    return [] if fine is None else [fine]
 
 
 def _standing(scene: Scene, h: Hypothesis, i: int, config: BeamConfig) -> Candidate | None:
