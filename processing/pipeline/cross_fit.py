@@ -25,6 +25,8 @@ from recordings.errors import BadInput
 TURNS, GAIN = 6, 0.1
 """A further turn is for tosses whose misfit fell by more than this in the last one, and the second for those that the
 first left open, too: on shapes that it corrected."""
+HALF_SQUARES = 9.0
+"""In a pair's cost of one: a residual of three scales, whose half square is 4.5, costs a half (`pair_terms`)."""
 FOLDS = 3
 """Into so many parts many tosses are split, each tracked on the others' shape; fewer tosses are left out singly."""
 
@@ -68,7 +70,7 @@ def refitted(
     run: Run, tracks: Mapping[int, Done], shape: Done, images: Mapping[int, Images], results: Mapping[int, TrackResult]
 ) -> dict[int, Done]:
     """Tosses on the shape of others; `results`: how sure each one's track was."""
-    return each(run, tracks, lambda t: chosen(run, tracks[t], shape, images[t], is_open(run, results[t])))
+    return each(run, tracks, lambda t: chosen(run, tracks[t], results[t], shape, images[t]))
 
 
 def own_misfits(run: Run, tracks: Mapping[int, Done], images: Mapping[int, Images]) -> dict[int, float]:
@@ -84,22 +86,31 @@ def worst_first(misfits: Mapping[int, float]) -> list[tuple[int, ...]]:
     return [tuple(int(t) for t in part) for part in np.array_split(order, min(FOLDS, len(order)))]
 
 
-def chosen(run: Run, before: Done, shape: Done, images: Images, anew: bool) -> Done:
-    """Of one toss: the track that it had or that refined on a shape, whichever fits itself better; or the object
-    located `anew` on it, where that fits better by more than chance: the frames have to tell another way of lying."""
-    ways: dict[str, Callable[[], Done | None]] = {"refined": lambda: track(run, images, shape, before=before)}
-    ways |= {"anew": lambda: located_on(run, images, shape)} if anew else {}
-    tried = each(run, ways, lambda way: ways[way]())
-    found = {"before": before, **{way: done for way, done in tried.items() if done is not None}}
+def chosen(run: Run, before: Done, known: TrackResult, shape: Done, images: Images) -> Done:
+    """Of one toss: the track that it had (of which is `known` what it cost) or that refined on a shape, whichever fits
+    itself better; or, where it is open, the object located anew on that, where it fits better by more than chance: the
+    frames have to tell another way of lying, and pairs of them must not contradict it."""
+    ways: dict[str, Callable[[], Done[TrackResult] | None]]
+    ways = {"refined": lambda: track(run, images, shape, before=before)}
+    ways |= {"anew": lambda: located_on(run, images, shape)} if is_open(run, known) else {}
+    tried = {way: done for way, done in each(run, ways, lambda way: ways[way]()).items() if done is not None}
+    found: dict[str, Done] = {"before": before, **tried}
     seen = each(run, found, lambda way: on_itself(run, found[way], images))
     best = min((way for way in found if way != "anew"), key=lambda way: misfit(seen[way]))
     if "anew" in found and misfit(seen["anew"]) < misfit(seen[best]):
         gap = difference(seen["anew"], seen[best], misfit_of)
-        best = "anew" if gap.mean > gap.by_chance else best
+        costs = {"before": known.cost, **{way: done.result.cost for way, done in tried.items()}}
+        best = "anew" if gap.mean > gap.by_chance + contradicted(costs[best], costs["anew"]) else best
     return found[best]
 
 
-def located_on(run: Run, images: Images, shape: Done) -> Done | None:
+def contradicted(cost: float | None, anew: float | None) -> float:
+    """Nats a frame by which pairs of frames speak against poses that cost more (`anew`); none where either is not
+    known."""
+    return 0.0 if cost is None or anew is None else HALF_SQUARES * (anew - cost)
+
+
+def located_on(run: Run, images: Images, shape: Done) -> Done[TrackResult] | None:
     """One toss tracked on a shape from the start; None where the shape fits nothing that its first frame shows."""
     try:
         return track(run, images, shape)

@@ -27,12 +27,14 @@ VERSION = 21
 
 @dataclass(frozen=True)
 class TrackResult:
-    """Frames of the toss; of them interpolated and lost ones, and those that no pose fits."""
+    """Frames of the toss; of them interpolated and lost ones, and those that no pose fits; `cost`: `TossTrack.own_cost`
+    (None: nothing to begin with)."""
 
     frames: int
     interpolated: int
     lost: int
     unfit: int = 0
+    cost: float | None = None
 
 
 def track(
@@ -64,7 +66,8 @@ def track(
         write_toss_track(folder, tracked)
         if before is None:
             write_notes(folder, images.toss, *notes_of(tracked, matcher_of(run.config.backends, run.device)))
-        return _result(tracked.track, unfit(tracked.store, tracked.cost, run.config.track.flags))
+        unfit_frames = unfit(tracked.store, tracked.cost, run.config.track.flags)
+        return _result(tracked.track, unfit_frames, tracked.own_cost)
 
     config = matcher_settings(run, run.config.track)
     config |= {} if before is None else {"second_pass": start_with}
@@ -99,5 +102,6 @@ def _second(toss: int, model: Done | None, before: Done, start_with: SecondPassS
     return {**given, "poses": track.camera_from_object, **shape}
 
 
-def _result(track: ObjectTrack, unfit: int = 0) -> TrackResult:
-    return TrackResult(len(track.status), track.status.count("interpolated"), track.status.count("lost"), unfit)
+def _result(track: ObjectTrack, unfit: int = 0, cost: float | None = None) -> TrackResult:
+    interpolated, lost = (track.status.count(status) for status in ("interpolated", "lost"))
+    return TrackResult(len(track.status), interpolated, lost, unfit, cost)

@@ -17,7 +17,17 @@ from processing.track.beam import LEAST_DELAY_S, Hypothesis, Scene
 from processing.track.center_of_mass import center_of_mass
 from processing.track.depth_color_offset import put_at_color_times
 from processing.track.flags import per_view
-from processing.track.joint_refinement import GraphConfig, Motion, Refined, is_held, refine, round_views, steady_motion
+from processing.track.joint_refinement import (
+    GraphConfig,
+    Motion,
+    Refined,
+    choose_pairs,
+    is_held,
+    refine,
+    round_views,
+    steady_motion,
+)
+from processing.track.pairs import compared
 from processing.track.revolution.axis import Axis, open_axis
 from processing.track.revolution.azimuth import (
     AzimuthConfig,
@@ -28,6 +38,7 @@ from processing.track.revolution.azimuth import (
     with_uncertainty,
 )
 from processing.track.revolution.profile import BodyConfig, RoundBody, anchored, is_round
+from processing.track.schedule import rows
 
 
 @dataclass(frozen=True)
@@ -270,6 +281,20 @@ def refined(
     motion_cost = mean_motion_cost(joint.poses[:n], use, scene, center_m, config.motion)
     runs = _held(joint.poses, use, motion, config.graph)
     return TrajectoryHypothesis(best, use, fixed, joint, center_m, motion, float(fit + motion_cost), runs, axis=axis)
+
+
+def own_cost(scene: Scene, hypothesis: TrajectoryHypothesis, config: HypothesisConfig) -> float:
+    """What the frames' own pairs and their motion cost at the poses, as `cost` does, whatever else these rest on."""
+    n, use, poses = len(scene.times_s), hypothesis.use, hypothesis.joint.poses
+    motion, store = hypothesis.motion, scene.store
+    frames = np.concatenate([use, np.zeros(len(poses) - n, dtype=bool)])
+    pairs = choose_pairs(poses, frames, motion.toss, hypothesis.center_m, motion.still, config.graph)
+    fit = 0.0
+    if len(pairs):
+        distance_m = float(np.median(np.linalg.norm(store.center_m[:n][use], axis=1)))
+        _, _, figures = compared(store, poses, pairs, rows(config.graph.schedule, distance_m)[-1], True)
+        fit = float(np.nanmean(per_view(pairs, figures, len(poses))[0][:n]))
+    return fit + mean_motion_cost(poses[:n], use, scene, hypothesis.center_m, config.motion)
 
 
 def _carried(scene: Scene, use: Bool[Array, " n"]) -> dict[tuple[int, int], Float[Array, "4 4"]]:

@@ -37,6 +37,7 @@ from processing.track.hypotheses import (
     all_refined,
     anchored_to,
     apart_deg,
+    own_cost,
     select,
 )
 from processing.track.keyframes import extended
@@ -88,6 +89,8 @@ class TossTrack:
     features: dict[int, Features]
     held: Int[Array, " n"]
     """Frames with the same number are a run through which a robot's hand carries the body; -1: none does."""
+    own_cost: float = 0.0
+    """Mean of what the frames' own pairs and their motion cost: what two tracks of the same frames are compared by."""
     round_body: bool = False
     """Whether the body is round and its azimuth was found from all frames at once: pairs of views alone would spoil
     it."""
@@ -374,5 +377,6 @@ def _as_track(
     track = ObjectTrack(toss, camera, object_frame, times_ns, poses, status, covariance)
     keyframes = tuple(i for i in sorted(best.estimated.keyframes) if i < n and not lost[i])
     pairs = joint.pairs[(joint.pairs < n).all(1)]
+    own = own_cost(scene, best, config.hypotheses)
     return TossTrack(track, cost, on, keyframes, pairs, rejected, best.center_m, scene.store,
-                     scene.features, best.held, best.axis is not None)  # fmt: skip
+                     scene.features, best.held, own, best.axis is not None)  # fmt: skip

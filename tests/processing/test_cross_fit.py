@@ -25,6 +25,7 @@ from recordings.session import Session
 from recordings.tracks import ObjectTrack
 
 SURE = TrackResult(frames=8, interpolated=0, lost=0)
+OPEN = TrackResult(frames=8, interpolated=8, lost=0, cost=0.1)
 TURN = np.array([0.0, 0.0, np.radians(10)])
 
 
@@ -165,14 +166,15 @@ def test_one_toss_stays_as_it_is(tiny_world: Any, tmp_path: Path) -> None:
 
 
 class Tried:
-    """Stands for the stage `track` and what its tracks leave: depth residuals (mm) of ten frames by way."""
+    """Stands for the stage `track` and what its tracks leave: depth residuals (mm) of ten frames by way, and what the
+    pairs of frames cost where it located the object anew (0.1 else)."""
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, folder: Path, **depth_mm: Any) -> None:
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, folder: Path, cost: float = 0.1, **depth_mm: Any) -> None:
         self.asked: list[str] = []
 
         def track(_: Any, __: Any, ___: Done, before: Done | None = None) -> Done:
             self.asked.append("anew" if before is None else "refined")
-            return Done(folder, self.asked[-1], None, False)
+            return Done(folder, self.asked[-1], replace(OPEN, cost=cost if before is None else 0.1), False)
 
         monkeypatch.setattr(cross_fit, "track", track)
         monkeypatch.setattr(cross_fit, "on_itself", lambda _, done, __: seen(depth_mm[done.key]))
@@ -185,8 +187,8 @@ def test_the_object_is_sought_anew_where_frames_are_not_sure(
 ) -> None:
     tosses = Tosses(tiny_world, tmp_path, 1)
     tried = Tried(monkeypatch, tmp_path, before=3.0, refined=2.0, anew=1.0)
-    anew = cross_fit.is_open(tosses.run, TrackResult(*frames))
-    found = cross_fit.chosen(tosses.run, tried.before, tried.shape, tosses.images[0], anew)
+    known = TrackResult(*frames)
+    found = cross_fit.chosen(tosses.run, tried.before, known, tried.shape, tosses.images[0])
     assert found.key == ("anew" if sought else "refined")
     assert tried.asked == ["refined", *(["anew"] if sought else [])]
 
@@ -197,7 +199,17 @@ def test_another_way_of_lying_has_to_fit_better_beyond_chance(
 ) -> None:
     tosses = Tosses(tiny_world, tmp_path, 1)
     tried = Tried(monkeypatch, tmp_path, before=3.0, refined=2.0, anew=anew)
-    assert cross_fit.chosen(tosses.run, tried.before, tried.shape, tosses.images[0], True).key == taken
+    assert cross_fit.chosen(tosses.run, tried.before, OPEN, tried.shape, tosses.images[0]).key == taken
+
+
+@pytest.mark.parametrize(("cost", "taken"), [(0.05, "anew"), (0.15, "anew"), (0.2, "refined")])
+def test_pairs_of_frames_may_contradict_what_the_surface_prefers(
+    cost: float, taken: str, monkeypatch: pytest.MonkeyPatch, tiny_world: Any, tmp_path: Path
+) -> None:
+    """A surface prefers the object anew by log(2) nats a frame."""
+    tosses = Tosses(tiny_world, tmp_path, 1)
+    tried = Tried(monkeypatch, tmp_path, cost, before=3.0, refined=2.0, anew=1.0)
+    assert cross_fit.chosen(tosses.run, tried.before, OPEN, tried.shape, tosses.images[0]).key == taken
 
 
 def test_a_track_that_the_shape_makes_worse_stays(
@@ -205,7 +217,7 @@ def test_a_track_that_the_shape_makes_worse_stays(
 ) -> None:
     tosses = Tosses(tiny_world, tmp_path, 1)
     tried = Tried(monkeypatch, tmp_path, before=2.0, refined=3.0)
-    assert cross_fit.chosen(tosses.run, tried.before, tried.shape, tosses.images[0], False) is tried.before
+    assert cross_fit.chosen(tosses.run, tried.before, SURE, tried.shape, tosses.images[0]) is tried.before
 
 
 def test_a_shape_that_fits_nothing_locates_no_toss(

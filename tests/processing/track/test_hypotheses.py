@@ -11,8 +11,9 @@ import pytest
 from processing.features.sift import Sift
 from processing.motion.interpolate import carried_on
 from processing.track.appearance_ratio import AppearanceRatioConfig, log_likelihood_ratio
-from processing.track.beam import Scene, seconds
-from processing.track.joint_refinement import GraphConfig, choose_pairs
+from processing.track.beam import Hypothesis, Scene, seconds
+from processing.track.hypotheses import HypothesisConfig, TrajectoryHypothesis, own_cost
+from processing.track.joint_refinement import GraphConfig, Motion, Refined, choose_pairs
 from processing.track.track_toss import TrackConfig, views_of
 from recordings.geometry import rotation_exp
 from recordings.progress import Silent
@@ -108,3 +109,31 @@ def test_a_label_decides_a_quarter_turn_of_a_square_bar_and_plain_paint_does_not
     nats = log_likelihood_ratio(scene, poses, flipped, use, config)
     assert nats == pytest.approx(-log_likelihood_ratio(scene, flipped, poses, use, config))
     assert nats > 3 if label else nats == 0
+
+
+def held_at(scene: Scene, poses: np.ndarray, drawn: int = 0) -> TrajectoryHypothesis:
+    """The frames at these poses, and after them so many views of a shape."""
+    n, yes, none = len(poses), np.ones(len(poses), dtype=bool), np.full(len(poses), np.nan)
+    views = n + drawn
+    times_s, toss = np.zeros(views), np.maximum(np.arange(views) - n + 1, 0)
+    times_s[:n] = scene.times_s
+    posed, fixed = np.concatenate([poses, poses[:drawn]]), np.arange(views) >= n
+    joint = Refined(posed, np.zeros((views, 6, 6)), np.zeros((0, 2), dtype=np.int64), np.zeros((0, 3)))
+    motion = Motion(times_s, toss, np.zeros(3), np.zeros(3), np.zeros(views, dtype=bool))
+    estimated = Hypothesis(poses, none, none, tuple(range(n)), (0,), 0.0)
+    return TrajectoryHypothesis(estimated, yes, fixed, joint, np.zeros(3), motion, 0.0, np.full(n, -1))
+
+
+def test_frames_of_which_a_part_is_turned_against_the_rest_cost_their_pairs_more(tiny_world: Any) -> None:
+    faces_rgb = np.array([[200, 60, 60], [60, 200, 60], [60, 60, 200], [200, 200, 60], [60, 200, 200], [200, 60, 200]])
+    scene, poses = seen_turning(tiny_world, faces_rgb)
+    turned = poses.copy()
+    turned[4:, :3, :3] = poses[4:, :3, :3] @ rotation_exp(np.array([np.radians(45), 0, 0]))
+    right, wrong = (own_cost(scene, held_at(scene, p), HypothesisConfig()) for p in (poses, turned))
+    assert 0 < right < wrong - 0.05
+
+
+def test_a_drawn_shape_takes_no_part_in_what_the_frames_own_pairs_cost(tiny_world: Any) -> None:
+    scene, poses = seen_turning(tiny_world, ONE_COLOR)
+    alone, on_shape = (own_cost(scene, held_at(scene, poses, drawn), HypothesisConfig()) for drawn in (0, 2))
+    assert alone == on_shape > 0
