@@ -27,6 +27,8 @@ TURNS, GAIN = 6, 0.1
 first left open, too: on shapes that it corrected."""
 HALF_SQUARES = 9.0
 """In a pair's cost of one: a residual of three scales, whose half square is 4.5, costs a half (`pair_terms`)."""
+FAR_BETTER = float(np.log(2.0))
+"""Nats a frame: half the residuals. A toss that lies right on a shape fits hardly worse than it does alone."""
 FOLDS = 3
 """Into so many parts many tosses are split, each tracked on the others' shape; fewer tosses are left out singly."""
 
@@ -98,16 +100,26 @@ def chosen(run: Run, before: Done, known: TrackResult, shape: Done, images: Imag
     seen = each(run, found, lambda way: on_itself(run, found[way], images))
     best = min((way for way in found if way != "anew"), key=lambda way: misfit(seen[way]))
     if "anew" in found and misfit(seen["anew"]) < misfit(seen[best]):
-        gap = difference(seen["anew"], seen[best], misfit_of)
         costs = {"before": known.cost, **{way: done.result.cost for way, done in tried.items()}}
-        best = "anew" if gap.mean > gap.by_chance + contradicted(costs[best], costs["anew"]) else best
+        best = "anew" if _surely_better(seen["anew"], seen[best], costs["anew"], costs[best]) else best
     return found[best]
 
 
-def contradicted(cost: float | None, anew: float | None) -> float:
-    """Nats a frame by which pairs of frames speak against poses that cost more (`anew`); none where either is not
-    known."""
-    return 0.0 if cost is None or anew is None else HALF_SQUARES * (anew - cost)
+def sure_alone(run: Run, images: Images, alone: Done[TrackResult], anew: Done[TrackResult]) -> bool:
+    """Whether a toss's own track fits its frames far better than the object located on a shape: by `FAR_BETTER`, and
+    that by more than chance."""
+    seen = on_itself(run, alone, images), on_itself(run, anew, images)
+    return _surely_better(*seen, alone.result.cost, anew.result.cost, FAR_BETTER)
+
+
+def _surely_better(
+    one: Explained, other: Explained, cost: float | None, other_cost: float | None, least: float = 0.0
+) -> bool:
+    """Whether frames fit one way of lying better than another by `least` and more than chance, with what their pairs
+    say (unless it is not known of both), in nats a frame."""
+    gap = difference(one, other, misfit_of)
+    pairs = 0.0 if cost is None or other_cost is None else HALF_SQUARES * (other_cost - cost)
+    return gap.mean + pairs > gap.by_chance + least
 
 
 def located_on(run: Run, images: Images, shape: Done) -> Done[TrackResult] | None:

@@ -12,7 +12,7 @@ import numpy as np
 
 from processing.images import Images
 from processing.pipeline import notices as say
-from processing.pipeline.cross_fit import cross_fitted, located_on
+from processing.pipeline.cross_fit import cross_fitted, located_on, sure_alone
 from processing.pipeline.passes import Pass
 from processing.run import Run, each
 from processing.stages.field import learn_field
@@ -39,7 +39,7 @@ def first_pass(run: Run, alone: Mapping[int, Done], images: Mapping[int, Images]
             break
         apart, tosses = (*apart, *alien), tuple(t for t in tosses if t not in alien)
     fitted = cross_fitted(run, images, dict.fromkeys(joined, placed), alone)
-    found = located(run, images, fitted, [t for t in run.tosses if t not in joined])
+    found = located(run, images, fitted, {t: alone[t] for t in run.tosses if t not in joined})
     if found:  # the others have not been on a shape with what these show
         fitted = cross_fitted(run, images, {**fitted, **found}, {**alone, **found})
     apart = tuple(sorted(t for t in apart if t not in found))
@@ -52,15 +52,17 @@ def first_pass(run: Run, alone: Mapping[int, Done], images: Mapping[int, Images]
 
 
 def located(
-    run: Run, images: Mapping[int, Images], joined: Mapping[int, Done], missing: Sequence[int]
+    run: Run, images: Mapping[int, Images], joined: Mapping[int, Done], missing: Mapping[int, Done]
 ) -> dict[int, Done]:
-    """Of tosses that registration could not join, those whose object is found on the shape of the others, by tracking
-    it there from the start, and is explained by it."""
+    """Of tosses that registration could not join (their tracks alone), those whose object is found on the shape of the
+    others, by tracking it there from the start, and is explained by it, unless their own tracks surely fit better."""
     if not missing:
         return {}
     shape = fuse_frames(run, joined, images)
     tracks = {t: done for t, done in each(run, missing, lambda t: located_on(run, images[t], shape)).items() if done}
-    return {t: done for t, done in tracks.items() if not _unexplained(run, done, shape, images, [t])}
+    explained = {t: done for t, done in tracks.items() if not _unexplained(run, done, shape, images, [t])}
+    alone = each(run, explained, lambda t: sure_alone(run, images[t], missing[t], explained[t]))
+    return {t: done for t, done in explained.items() if not alone[t]}
 
 
 def start_alone(run: Run, toss: int, first: Pass, alone: Done, images: Mapping[int, Images]) -> Pass:

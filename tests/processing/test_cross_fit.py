@@ -231,13 +231,28 @@ def test_a_shape_that_fits_nothing_locates_no_toss(
     assert cross_fit.located_on(tosses.run, tosses.images[0], Done(tmp_path, "shape", None, False)) is None
 
 
-def test_a_toss_that_was_not_joined_is_found_on_the_shape_of_the_others(tiny_world: Any, tmp_path: Path) -> None:
+@pytest.mark.parametrize("drifted", [0, 1])
+def test_a_toss_that_was_not_joined_is_found_on_the_shape_of_the_others(
+    drifted: int, tiny_world: Any, tmp_path: Path
+) -> None:
+    """Whether its own track was right or not."""
     tosses = Tosses(tiny_world, tmp_path, 2)
     joined = {0: tosses.track(0, 0 * TURN, "track-0")}
-    found = first_pass.located(tosses.run, tosses.images, joined, [1])
+    found = first_pass.located(tosses.run, tosses.images, joined, {1: tosses.track(1, drifted * TURN, "alone-1")})
     assert set(found) == {1}
     assert tosses.off_deg(1, found[1]) < 3
-    assert first_pass.located(tosses.run, tosses.images, joined, []) == {}
+    assert first_pass.located(tosses.run, tosses.images, joined, {}) == {}
+
+
+@pytest.mark.parametrize(("anew_mm", "anew_cost", "sure"), [(2.2, 0.1, False), (1.8, 0.2, True), (4.5, 0.1, True)])
+def test_a_track_alone_that_fits_far_better_is_kept(
+    anew_mm: float, anew_cost: float, sure: bool, monkeypatch: pytest.MonkeyPatch, tiny_world: Any, tmp_path: Path
+) -> None:
+    tosses, depth_mm = Tosses(tiny_world, tmp_path, 1), {"alone": 2.0, "anew": anew_mm}
+    monkeypatch.setattr(cross_fit, "on_itself", lambda _, done, __: seen(depth_mm[done.key]))
+    alone = Done(tmp_path, "alone", OPEN, False)
+    anew = Done(tmp_path, "anew", replace(OPEN, cost=anew_cost), False)
+    assert cross_fit.sure_alone(tosses.run, tosses.images[0], alone, anew) == sure
 
 
 def test_tosses_that_show_nothing_sure_correct_no_other(tiny_world: Any, tmp_path: Path) -> None:
