@@ -39,7 +39,8 @@ def first_pass(run: Run, alone: Mapping[int, Done], images: Mapping[int, Images]
             break
         apart, tosses = (*apart, *alien), tuple(t for t in tosses if t not in alien)
     fitted = cross_fitted(run, images, dict.fromkeys(joined, placed), alone)
-    found = located(run, images, fitted, {t: alone[t] for t in run.tosses if t not in joined})
+    missing = [t for t in run.tosses if t not in joined]
+    found = located(run, images, fitted, missing, {t: alone[t] for t in apart})
     if found:  # the others have not been on a shape with what these show
         fitted = cross_fitted(run, images, {**fitted, **found}, {**alone, **found})
     apart = tuple(sorted(t for t in apart if t not in found))
@@ -52,17 +53,20 @@ def first_pass(run: Run, alone: Mapping[int, Done], images: Mapping[int, Images]
 
 
 def located(
-    run: Run, images: Mapping[int, Images], joined: Mapping[int, Done], missing: Mapping[int, Done]
-) -> dict[int, Done]:
-    """Of tosses that registration could not join (their tracks alone), those whose object is found on the shape of the
-    others, by tracking it there from the start, and is explained by it, unless their own tracks surely fit better."""
+    run: Run, images: Mapping[int, Images], joined: Mapping[int, Done], missing: Sequence[int],
+    apart: Mapping[int, Done],
+) -> dict[int, Done]:  # fmt: skip
+    """Of tosses that are not among the `joined` ones, those whose object is found on the shape of these, by tracking
+    it there from the start, and is explained by it; of those that were kept `apart` (their own tracks, which would
+    stay) none that surely fits better alone."""
     if not missing:
         return {}
     shape = fuse_frames(run, joined, images)
     tracks = {t: done for t, done in each(run, missing, lambda t: located_on(run, images[t], shape)).items() if done}
     explained = {t: done for t, done in tracks.items() if not _unexplained(run, done, shape, images, [t])}
-    alone = each(run, explained, lambda t: sure_alone(run, images[t], missing[t], explained[t]))
-    return {t: done for t, done in explained.items() if not alone[t]}
+    asked = [t for t in explained if t in apart]
+    better = each(run, asked, lambda t: sure_alone(run, images[t], apart[t], explained[t]))
+    return {t: done for t, done in explained.items() if not better.get(t, False)}
 
 
 def start_alone(run: Run, toss: int, first: Pass, alone: Done, images: Mapping[int, Images]) -> Pass:
