@@ -95,7 +95,7 @@ class Scene:
         """Whether the body flies in all these frames."""
         return self.flying is not None and bool(self.flying[list(frames)].all())
 
-    def held(self, frame: int) -> bool:
+    def before_flight(self, frame: int) -> bool:
         """Whether the body's flight is still to come."""
         return self.flying is not None and bool(self.flying[frame:].any() and not self.flying[: frame + 1].any())
 
@@ -186,7 +186,7 @@ def _put_at_color_time(scene: Scene, h: Hypothesis, i: int, config: BeamConfig) 
     a, b = tracked[max(-3, -len(tracked))], tracked[-1]
     step_s = scene.times_s[b] - scene.times_s[a]
     spin = steady_spin(h.poses[tracked[-6:]], scene.times_s[tracked[-6:]])
-    gravity = scene.gravity_camera_m_s2 * (not scene.held(i))
+    gravity = scene.gravity_camera_m_s2 * (not scene.before_flight(i))
     color, depth = (
         moved(h.poses[a], h.poses[b], step_s, t - scene.times_s[b], scene.center_m, gravity, spin)
         for t in (scene.times_s[i], scene.times_s[i] + crop.depth_delay_s)

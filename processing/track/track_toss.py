@@ -89,8 +89,9 @@ class TossTrack:
     features: dict[int, Features]
     held: Int[Array, " n"]
     """Frames with the same number are a run through which a robot's hand carries the body; -1: none does."""
-    own_cost: float = 0.0
-    """Mean of what the frames' own pairs and their motion cost: what two tracks of the same frames are compared by."""
+    own_cost: float | None = None
+    """Mean of what the frames' own pairs and their motion cost, by which two tracks of the same frames are compared;
+    None: read from a file, which does not keep it."""
     round_body: bool = False
     """Whether the body is round and its azimuth was found from all frames at once: pairs of views alone would spoil
     it."""
