@@ -22,60 +22,73 @@ from processing.stages.place import place_shape
 from processing.stages.register import register
 from processing.store import Done
 from processing.variants import refuse_baseline
+from recordings.errors import BadInput
 
 
 def first_pass(run: Run, alone: Mapping[int, Done], images: Mapping[int, Images]) -> Pass:
     """P, O: all tosses in one object frame, and one shape. Tosses that the shape of all does not explain are kept
-    apart, and the others joined anew: they were refined together with the wrong ones."""
+    apart, and the others joined anew: they were refined together with the wrong ones. Kept apart, too, are those that
+    do not come into that object frame; only one that shows no shape of its own is lost."""
     refuse_baseline(run.tracker)
     tosses, warnings = run.tosses, list(say.of_tracks(alone))
-    apart: tuple[int, ...] = ()
+    alien: tuple[int, ...] = ()
     while True:
         placed = register(run, {t: alone[t] for t in tosses}, images)
         joined = [t for t in tosses if t not in placed.result.not_joined]
         fused = fuse_frames(run, dict.fromkeys(joined, placed), images)
-        alien = kept_apart(run, placed, fused, images, joined)
-        if not alien:
+        unexplained = kept_apart(run, placed, fused, images, joined)
+        if not unexplained:
             break
-        apart, tosses = (*apart, *alien), tuple(t for t in tosses if t not in alien)
+        alien, tosses = (*alien, *unexplained), tuple(t for t in tosses if t not in unexplained)
     fitted = cross_fitted(run, images, dict.fromkeys(joined, placed), alone)
-    missing = [t for t in run.tosses if t not in joined]
-    found = located(run, images, fitted, missing, {t: alone[t] for t in apart})
+    found = located(run, images, fitted, {t: alone[t] for t in run.tosses if t not in joined})
     if found:  # the others have not been on a shape with what these show
         fitted = cross_fitted(run, images, {**fitted, **found}, {**alone, **found})
-    apart = tuple(sorted(t for t in apart if t not in found))
-    warnings += [say.kept_apart(apart)] if apart else []
-    warnings += say.of_register(placed, found)
-    tracks = {**dict.fromkeys(tosses, placed), **fitted}
-    tracks = {t: tracks[t] for t in run.tosses if t not in apart}
+    left = [t for t in placed.result.not_joined if t not in found]
+    shown = each(run, left, lambda t: own_shape(run, t, alone[t], images))
+    lost = [t for t in left if shown[t] is None]
+    alien = tuple(sorted(t for t in alien if t not in found))
+    warnings += [say.kept_apart(alien)] if alien else []
+    warnings += say.of_register(placed, found, lost)
+    tracks = {**fitted, **dict.fromkeys(lost, placed)}
+    tracks = {t: tracks[t] for t in run.tosses if t in tracks}
     shape = learn_field(run, "all tosses", fitted, images)
-    return Pass(tracks, dict.fromkeys(tracks, shape), shared_frame=not apart, warnings=tuple(warnings))
+    shared = len(tracks) == len(run.tosses)
+    return Pass(tracks, dict.fromkeys(tracks, shape), shared_frame=shared, warnings=tuple(warnings))
 
 
 def located(
-    run: Run, images: Mapping[int, Images], joined: Mapping[int, Done], missing: Sequence[int],
-    apart: Mapping[int, Done],
-) -> dict[int, Done]:  # fmt: skip
-    """Of tosses that are not among the `joined` ones, those whose object is found on the shape of these, by tracking
-    it there from the start, and is explained by it; of those that were kept `apart` (their own tracks, which would
-    stay) none that surely fits better alone."""
+    run: Run, images: Mapping[int, Images], joined: Mapping[int, Done], missing: Mapping[int, Done]
+) -> dict[int, Done]:
+    """Of tosses that are not among the `joined` ones (`missing`: their own tracks, which would stay), those whose
+    object is found on the shape of these, by tracking it there from the start, and is explained by it; none of them
+    that surely fits better alone."""
     if not missing:
         return {}
     shape = fuse_frames(run, joined, images)
     tracks = {t: done for t, done in each(run, missing, lambda t: located_on(run, images[t], shape)).items() if done}
     explained = {t: done for t, done in tracks.items() if not _unexplained(run, done, shape, images, [t])}
-    asked = [t for t in explained if t in apart]
-    better = each(run, asked, lambda t: sure_alone(run, images[t], apart[t], explained[t]))
-    return {t: done for t, done in explained.items() if not better.get(t, False)}
+    better = each(run, explained, lambda t: sure_alone(run, images[t], missing[t], explained[t]))
+    return {t: done for t, done in explained.items() if not better[t]}
+
+
+def own_shape(run: Run, toss: int, alone: Done, images: Mapping[int, Images]) -> Done | None:
+    """The shape that one toss shows by its own track; None where that shows too little."""
+    try:
+        return learn_field(run, f"toss {toss}", {toss: alone}, images)
+    except BadInput:
+        return None
 
 
 def start_alone(run: Run, toss: int, first: Pass, alone: Done, images: Mapping[int, Images]) -> Pass:
-    """Where the cycle begins on one toss: p_i, and O in its object frame. A toss that is lost in P does not say how O
-    lies in it (it may be another object's): its own shape is taken."""
-    placed: Done = place_shape(run, toss, first.tracks[toss], alone, first.shapes[toss])
-    lost = not placed.result.frames
-    shape = learn_field(run, f"toss {toss}", {toss: alone}, images) if lost else placed
-    return Pass({toss: alone}, {toss: shape}, shared_frame=False, warnings=say.lost_among_all(toss) if lost else ())
+    """Where the cycle begins on one toss: p_i, and O in its object frame. A toss that is not in P, or lost there, does
+    not say how O lies in it (it may be another object's): its own shape is taken."""
+    if toss in first.tracks:
+        placed: Done = place_shape(run, toss, first.tracks[toss], alone, first.shapes[toss])
+        if placed.result.frames:
+            return Pass({toss: alone}, {toss: placed}, shared_frame=False)
+    own = learn_field(run, f"toss {toss}", {toss: alone}, images)
+    return Pass({toss: alone}, {toss: own}, shared_frame=False, warnings=say.lost_among_all(toss))
 
 
 def kept_apart(

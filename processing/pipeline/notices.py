@@ -118,15 +118,18 @@ def of_contact(done: Done) -> list[Notice]:
     return [Notice.from_json(n) for n in stored]
 
 
-def of_register(done: Done[RegisterResult], located: Collection[int] = ()) -> list[Notice]:
+def of_register(
+    done: Done[RegisterResult], located: Collection[int] = (), lost: Collection[int] = ()
+) -> list[Notice]:
     """Tosses that are not in the object frame of the others, or not surely; `located`: those that were found on the
-    others' shape all the same."""
+    others' shape all the same; `lost`: those that have no shape of their own, either."""
     left_out = [t for t in done.result.not_joined if t not in located]
     found, unsure = [], list(done.result.ambiguous)
-    if left_out:
-        seen = f"tosses {left_out} could not be brought into the object frame of the others: lost"
-        do = f"most often they show other sides than the rest, or too little detail; seldom it is another object: {SEE}"
-        found.append(Notice("register", "high", seen, do))
+    do = f"most often they show other sides than the rest, or too little detail; seldom it is another object: {SEE}"
+    for state, tosses in (("kept apart", [t for t in left_out if t not in lost]), ("lost", sorted(lost))):
+        if tosses:
+            seen = f"tosses {tosses} could not be brought into the object frame of the others: {state}"
+            found.append(Notice("register", "high", seen, do))
     if unsure:
         seen = f"tosses {unsure}: the object looks alike from several sides; their object frame may be turned"
         found.append(Notice("register", "high", seen, "compare their frames in `toss-view RESULTS`", "possible"))
@@ -142,7 +145,7 @@ def kept_apart(tosses: Sequence[int]) -> Notice:
 
 def lost_among_all(toss: int) -> tuple[Notice, ...]:
     """A toss whose cycle begins with its own shape."""
-    return (Notice("place", "medium", f"toss {toss} is lost among all tosses: the cycle begins with its own shape"),)
+    return (Notice("place", "medium", f"toss {toss} is not among the others: the cycle begins with its own shape"),)
 
 
 def contact_kept_out(name: str, why: str) -> Notice:

@@ -96,7 +96,7 @@ def together(run: Run, variant: Variant, scope: Scope, alone: Mapping[int, Done]
     if variant.refined is not None and scope == "all":
         last = with_rollouts(run, variant, run_cycle(run, variant, first, images, "all tosses"))
     elif variant.refined is not None:
-        last = Pass.joined([*each(run, first.tracks, cycle_of).values()])
+        last = Pass.joined([*each(run, run.tosses, cycle_of).values()])
     apart = {t: alone[t] for t in run.tosses if t not in last.tracks}  # in their own object frames
     shapes = each(run, apart, lambda t: learn_field(run, f"toss {t}", {t: alone[t]}, images))
     return replace(last, tracks={**last.tracks, **apart}, shapes={**last.shapes, **shapes},

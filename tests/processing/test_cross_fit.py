@@ -239,20 +239,19 @@ def test_a_toss_that_was_not_joined_is_found_on_the_shape_of_the_others(
     tosses = Tosses(tiny_world, tmp_path, 2)
     joined = {0: tosses.track(0, 0 * TURN, "track-0")}
     apart = {1: tosses.track(1, drifted * TURN, "alone-1")}
-    found = first_pass.located(tosses.run, tosses.images, joined, [1], apart)
+    found = first_pass.located(tosses.run, tosses.images, joined, apart)
     assert set(found) == {1}
     assert tosses.off_deg(1, found[1]) < 3
-    assert first_pass.located(tosses.run, tosses.images, joined, [], {}) == {}
+    assert first_pass.located(tosses.run, tosses.images, joined, {}) == {}
 
 
-def test_a_toss_that_would_be_lost_is_located_however_well_it_fits_alone(
+def test_a_toss_that_surely_fits_better_alone_is_not_located_on_the_others(
     monkeypatch: pytest.MonkeyPatch, tiny_world: Any, tmp_path: Path
 ) -> None:
     tosses = Tosses(tiny_world, tmp_path, 2)
     joined, own = {0: tosses.track(0, 0 * TURN, "track-0")}, {1: tosses.track(1, 0 * TURN, "alone-1")}
     monkeypatch.setattr(first_pass, "sure_alone", lambda *_: True)
-    assert set(first_pass.located(tosses.run, tosses.images, joined, [1], {})) == {1}
-    assert first_pass.located(tosses.run, tosses.images, joined, [1], own) == {}
+    assert first_pass.located(tosses.run, tosses.images, joined, own) == {}
 
 
 @pytest.mark.parametrize(("anew_mm", "anew_cost", "sure"), [(2.2, 0.1, False), (1.8, 0.2, True), (4.5, 0.1, True)])
