@@ -118,9 +118,7 @@ def of_contact(done: Done) -> list[Notice]:
     return [Notice.from_json(n) for n in stored]
 
 
-def of_register(
-    done: Done[RegisterResult], located: Collection[int] = (), lost: Collection[int] = ()
-) -> list[Notice]:
+def of_register(done: Done[RegisterResult], located: Collection[int] = (), lost: Collection[int] = ()) -> list[Notice]:
     """Tosses that are not in the object frame of the others, or not surely; `located`: those that were found on the
     others' shape all the same; `lost`: those that have no shape of their own, either."""
     left_out = [t for t in done.result.not_joined if t not in located]
