@@ -46,14 +46,15 @@ class LiveConfig:
 
 
 def light(config: Config) -> Config:
-    """The settings of the stages for a first look: fewer frames of the scene, a narrower beam, no windows, a shorter
-    refinement. What comes of them is shown and then made anew by the pipeline's own settings."""
+    """The settings of the stages for a first look: fewer frames of the scene, a narrower beam, neither windows nor
+    crossovers, a shorter refinement. What comes of them is shown and then made anew by the pipeline's own settings."""
     schedule = ((1, 2, 0.006, 0.4, 0.008, 0.3), (0, 3, 0.004, 0.3, 0.005, 0.5), (0, 3, 0.0035, 0.1, 0.002, 0.8))
     graph = GraphConfig(loops=4, schedule=schedule)
     track = replace(
         config.track,
         beam=BeamConfig(width=2, branches=2),
         windows=replace(config.track.windows, rounds=0),
+        crossover=replace(config.track.crossover, rounds=0),
         hypotheses=HypothesisConfig(graph=graph),
     )
     robot = RobotFitSettings(frames=6, steps=4, stride=6, outlines=150)

@@ -45,7 +45,7 @@ LEAST_SLOPE, LEAST_BRIGHT_SLOPE = 0.03, 0.1
 """An appearance that changes by less a pixel is shading, which stays with the room: it pulls little; brightness above
 all."""
 SHADING = 3 * APPEARANCE
-"""Unknowns of a pair's shading (processing/track/shading.py): what each channel gains along the normal's x, y, z."""
+"""Unknowns of a pair's shading (processing/track/pairs.py): what each channel gains along the normal's x, y, z."""
 NO_SHADING = np.empty((0, 0)), np.empty((0, 0))
 """B and N of pair_terms where it is not sought."""
 GRAZING, FACING = 0.3, 0.8

@@ -20,6 +20,7 @@ from processing.sensor.rectification import Rectification
 from processing.sensor.view import Crop, ViewConfig, cut
 from processing.sensor.view_store import ViewStore
 from processing.track.beam import BeamConfig, Candidate, Hypothesis, Scene, follow, seconds, started
+from processing.track.crossover import CrossoverConfig, crossed
 from processing.track.depth_color_offset import unknown_motion
 from processing.track.flags import (
     FlagConfig,
@@ -57,6 +58,7 @@ class TrackConfig:
     view: ViewConfig = field(default_factory=ViewConfig)
     beam: BeamConfig = field(default_factory=BeamConfig)
     windows: WindowConfig = field(default_factory=WindowConfig)
+    crossover: CrossoverConfig = field(default_factory=CrossoverConfig)
     hypotheses: HypothesisConfig = field(default_factory=HypothesisConfig)
     flags: FlagConfig = field(default_factory=FlagConfig)
     shape: ShapeConfig = field(default_factory=ShapeConfig)
@@ -169,6 +171,11 @@ def track_toss(
         scene, first, found, config.beam.keyframes, config.windows, config.hypotheses,
         lambda share: progress.step(2 * n + int(share * n), 3 * n, "windows"),
     )  # fmt: skip
+    if known.poses is None and known.model is None:
+        found += crossed(
+            scene, first, sorted(found, key=lambda h: h.cost), config.crossover, config.hypotheses,
+            lambda share: progress.step(2 * n + int(share * n), 3 * n, "crossovers"),
+        )  # fmt: skip
     joint = select(scene, found, first, keep_first, known.poses is None, config.hypotheses)
     object_frame = object_frame if model is None else model.object_frame
     return _as_track(scene, joint, first, rejected, config, toss, camera.frame, object_frame, times_ns)

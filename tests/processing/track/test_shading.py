@@ -8,7 +8,7 @@ import pytest
 from processing.motion import se3_kernels as se3
 from processing.sensor import view_layout as lay
 from processing.track import kernels as k
-from processing.track.shading import SIGMA, eliminated
+from processing.track.pairs import SHADING_SIGMA, eliminated
 
 FOCAL, CENTER, SIDE = np.array([500.0, 500.0]), np.array([40.0, 40.0]), 80
 BALL_M, FAR_M = 0.05, 0.8
@@ -68,7 +68,7 @@ def test_print_says_of_a_turn_as_much_as_before() -> None:
 def test_what_shading_and_a_motion_do_together_is_told_apart() -> None:
     rng = np.random.default_rng(5)
     J, K = rng.normal(size=(400, 6)), rng.normal(size=(400, k.SHADING))
-    motion, shading = rng.normal(size=6), 0.1 * SIGMA * rng.normal(size=k.SHADING)
+    motion, shading = rng.normal(size=6), 0.1 * SHADING_SIGMA * rng.normal(size=k.SHADING)
     r = -(J @ motion + K @ shading)
     among = np.concatenate([K.T @ K, (K.T @ r)[None]])
     H, g = eliminated((J.T @ J)[None], (J.T @ r)[None], (J.T @ K)[None], among[None])

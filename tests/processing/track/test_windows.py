@@ -1,4 +1,4 @@
-"""Short windows linked through an impact, from hypotheses that are both wrong; the cheapest path of known motions."""
+"""Short windows linked through an impact, and crossovers, from hypotheses that are both wrong."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from processing.features.sift import Sift
 from processing.live.config import light
 from processing.motion.motion_prior import gravity_in_camera
 from processing.track.beam import Scene, seconds
+from processing.track.crossover import crossed, crossed_at, cuts_between
 from processing.track.hypotheses import TrajectoryHypothesis, refined
 from processing.track.track_toss import TrackConfig, first_pose, started, views_of
 from processing.track.windows import WindowConfig, _distinct, _poses, through_windows
@@ -57,10 +58,31 @@ def sliding(scene: Scene, spin: Array) -> TrajectoryHypothesis:
     for i, pose in enumerate(poses):
         pose[:3, :3] = rotation_exp(spin * i * STEP_S) @ pose[:3, :3]
         pose[:3, 3] += scene.store.center_m[i] - scene.store.center_m[0]
-    estimated = replace(h, poses=poses, done=tuple(range(FRAMES)))
+    return judged(scene, poses)
+
+
+def judged(scene: Scene, poses: Array) -> TrajectoryHypothesis:
+    """A hypothesis at these poses, not refined."""
+    estimated = replace(started(scene.store, FRAMES, 0, poses[0]), poses=poses, done=tuple(range(FRAMES)))
     graph = replace(TrackConfig().hypotheses.graph, schedule=((0, 1, 0.004, 0.1, 0.004, 0.5),))
-    judged = refined(scene, estimated, 0, True, replace(TrackConfig().hypotheses, graph=graph))
-    return replace(judged, joint=replace(judged.joint, poses=poses))
+    found = refined(scene, estimated, 0, True, replace(TrackConfig().hypotheses, graph=graph))
+    return replace(found, joint=replace(found.joint, poses=poses))
+
+
+def turned(scene: Scene, world_from_camera: Transform, before: Array, after: Array) -> Array:
+    """The true poses with spins (rad/s, camera axes) added to those before the impact and after it."""
+    poses = np.tile(first_pose(scene.store, 0), (FRAMES, 1, 1))
+    camera_from_world = np.linalg.inv(world_from_camera.matrix)
+    true = np.stack([camera_from_world @ thrown(i).matrix for i in range(FRAMES)])
+    own_from_true = np.linalg.inv(true[0]) @ poses[0]
+    for i in range(1, FRAMES):
+        added = rotation_exp((before if i <= IMPACT else after) * STEP_S)
+        step = true[i] @ np.linalg.inv(true[i - 1])
+        poses[i] = step @ poses[i - 1]
+        center = (true[i] @ own_from_true)[:3, 3]
+        poses[i, :3, :3] = added @ poses[i, :3, :3]
+        poses[i, :3, 3] = center
+    return poses
 
 
 def test_windows_find_both_spins_of_an_impact_that_no_hypothesis_has(scene: Scene, tiny_world: Any) -> None:
@@ -119,3 +141,53 @@ def test_linked_motions_pass_through_the_given_pose_and_leave_other_frames_out()
     np.testing.assert_allclose(steps[0] @ out[0], pose)
     np.testing.assert_allclose(out[3], steps[1] @ pose)
     assert np.isnan(out[[1, 4]]).all()
+
+
+NONE, WRONG = np.zeros(3), np.array([0.0, 3.0, 2.0])
+"""A spin that is wrong by 7 degrees a frame."""
+
+
+def both_half_wrong(scene: Scene, world: Any) -> list[TrajectoryHypothesis]:
+    spins = ((NONE, WRONG), (WRONG, NONE))
+    return [judged(scene, turned(scene, world.world_from_camera, *spin)) for spin in spins]
+
+
+def test_a_crossover_leaves_both_errors_behind(scene: Scene, tiny_world: Any) -> None:
+    wrong, config = both_half_wrong(scene, tiny_world), TrackConfig()
+    (found,) = crossed(scene, 0, wrong, config.crossover, config.hypotheses)
+    assert found.cost < min(h.cost for h in wrong)
+    true = turned(scene, tiny_world.world_from_camera, NONE, NONE)
+    np.testing.assert_array_equal(found.joint.poses[0], true[0])
+    assert max(np.degrees(rotation_angle_rad(a.T @ b)) for a, b in zip(found.joint.poses[:, :3, :3], true[:, :3, :3],
+                                                                      strict=True)) < 4.0  # fmt: skip
+
+
+def test_a_child_is_one_parent_up_to_the_cut_and_moves_as_the_other_from_there_on(
+    scene: Scene, tiny_world: Any
+) -> None:
+    one, other = both_half_wrong(scene, tiny_world)
+    other = replace(other, use=np.arange(FRAMES) != IMPACT + 2)
+    poses = crossed_at(one, other, IMPACT, 0, one.joint.poses[0]).estimated.poses
+    np.testing.assert_allclose(poses[: IMPACT + 1], one.joint.poses[: IMPACT + 1], atol=1e-12)
+    after = [p[IMPACT + 3 :] @ np.linalg.inv(p[IMPACT]) for p in (poses, other.joint.poses)]  # in camera axes
+    np.testing.assert_allclose(after[0], after[1], atol=1e-12)
+    assert np.flatnonzero(~np.isfinite(poses[:, 0, 0])).tolist() == [IMPACT + 2]
+    pose = one.joint.poses[0].copy()
+    pose[:3, :3] = pose[:3, :3] @ rotation_exp(np.array([0.1, 0.2, 0.3]))
+    np.testing.assert_array_equal(crossed_at(one, other, IMPACT, 0, pose).estimated.poses[0], pose)
+
+
+def test_hypotheses_that_differ_on_one_side_only_are_not_cut(scene: Scene, tiny_world: Any) -> None:
+    right, later = (judged(scene, turned(scene, tiny_world.world_from_camera, NONE, s)) for s in (NONE, WRONG))
+    config = TrackConfig()
+    degrees = config.hypotheses.agreeing_deg
+    assert len(cuts_between(right, right, config.crossover, degrees)) == 0
+    cuts = cuts_between(right, later, config.crossover, degrees)
+    assert all(cut > IMPACT for cut in cuts)  # before the impact they are alike
+    first, second = both_half_wrong(scene, tiny_world)
+    assert IMPACT in cuts_between(first, second, config.crossover, degrees)
+
+
+def test_the_live_looks_settings_cross_nothing(scene: Scene, tiny_world: Any) -> None:
+    config = light(Config()).track
+    assert crossed(scene, 0, both_half_wrong(scene, tiny_world), config.crossover, config.hypotheses) == []
