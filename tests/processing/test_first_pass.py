@@ -108,10 +108,8 @@ def test_the_others_are_joined_anew_without_a_toss_that_is_kept_apart(
     def fuse(_: Run, tracks: dict[int, Done], __: Any) -> Done:
         return Done(tmp_path, f"fused {sorted(tracks)}", None, False)
 
-    def located(
-        _: Run, __: Any, joined: dict[int, Done], missing: list[int], apart: dict[int, Done]
-    ) -> dict[int, Done]:
-        assert (sorted(joined), missing, apart) == ([0, 2], [1], {1: alone[1]})
+    def located(_: Run, __: Any, joined: dict[int, Done], missing: dict[int, Done]) -> dict[int, Done]:
+        assert (sorted(joined), missing) == ([0, 2], {1: alone[1]})
         return {1: Done(tmp_path, "located", None, False)} if found_again else {}
 
     fakes = {"register": register, "learn_field": field, "kept_apart": apart, "fuse_frames": fuse, "located": located}
