@@ -48,7 +48,7 @@ AZIMUTH_APPEARANCE_GAIN, AZIMUTH_SHAPE_GAIN = 0.125, 0.25
 """The same of neighbouring cells of an unwrapped round body."""
 TRACK_COVARIANCE_SCALE = 6.75
 """Covariances of the joint refinement times this: its residuals share more noise than it knows (shading, the depth
-camera's fixed pattern). From the normalised errors on `choose` (23 tosses): with standard deviations 1, 1.5, 2 and 3
+camera's fixed pattern). From the normalised errors on `choose` (22 tosses): with standard deviations 1, 1.5, 2 and 3
 times those of a scale of 3, the 95 % ellipsoid holds .69, .76, .79 and .83 of a toss's sure frames; the first step
 gains most, what then lies outside are wrong modes."""
 ROBOT_SIGMA_SCALE = 6.0
