@@ -80,15 +80,17 @@ def own_shape(run: Run, toss: int, alone: Done, images: Mapping[int, Images]) ->
         return None
 
 
-def start_alone(run: Run, toss: int, first: Pass, alone: Done, images: Mapping[int, Images]) -> Pass:
+def start_alone(run: Run, toss: int, first: Pass, alone: Done, images: Mapping[int, Images]) -> Pass | None:
     """Where the cycle begins on one toss: p_i, and O in its object frame. A toss that is not in P, or lost there, does
-    not say how O lies in it (it may be another object's): its own shape is taken."""
+    not say how O lies in it (it may be another object's): its own shape is taken. None where a lost one has none."""
     if toss in first.tracks:
         placed: Done = place_shape(run, toss, first.tracks[toss], alone, first.shapes[toss])
         if placed.result.frames:
             return Pass({toss: alone}, {toss: placed}, shared_frame=False)
+        if own_shape(run, toss, alone, images) is None:
+            return None
     own = learn_field(run, f"toss {toss}", {toss: alone}, images)
-    return Pass({toss: alone}, {toss: own}, shared_frame=False, warnings=say.lost_among_all(toss))
+    return Pass({toss: alone}, {toss: own}, shared_frame=False, warnings=say.not_among_others(toss))
 
 
 def kept_apart(

@@ -141,7 +141,7 @@ def kept_apart(tosses: Sequence[int]) -> Notice:
     return Notice("register", "high", seen, f"{do}: {SEE}")
 
 
-def lost_among_all(toss: int) -> tuple[Notice, ...]:
+def not_among_others(toss: int) -> tuple[Notice, ...]:
     """A toss whose cycle begins with its own shape."""
     return (Notice("place", "medium", f"toss {toss} is not among the others: the cycle begins with its own shape"),)
 

@@ -91,6 +91,8 @@ def together(run: Run, variant: Variant, scope: Scope, alone: Mapping[int, Done]
 
     def cycle_of(toss: int) -> Pass:
         start = start_alone(run, toss, first, alone[toss], images)
+        if start is None:  # it is lost, and stays so
+            return Pass({toss: first.tracks[toss]}, {toss: first.shapes[toss]}, shared_frame=False)
         return run_cycle(run, variant, start, images, f"toss {toss}")
 
     if variant.refined is not None and scope == "all":

@@ -17,9 +17,16 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray as Array
 
-from processing.track.beam import Scene
+from processing.track.beam import Hypothesis, Scene
 from processing.track.flags import per_view
-from processing.track.hypotheses import HypothesisConfig, TrajectoryHypothesis, apart_deg, own_cost, refined
+from processing.track.hypotheses import (
+    HypothesisConfig,
+    TrajectoryHypothesis,
+    anchored_to,
+    apart_deg,
+    own_cost,
+    refined,
+)
 
 Cut = tuple[int, int, int]
 """Positions of two parents among all, and the last frame that is the first one's."""
@@ -47,8 +54,8 @@ def crossed(
     refinement: HypothesisConfig, report: Callable[[float], None] = lambda _: None,
 ) -> list[TrajectoryHypothesis]:  # fmt: skip
     """The cheapest refined child of the hypotheses (the best one first) and of their children, through the best one's
-    pose of frame `first`; none where no child costs less than all of them. `report` is told the share of the work that
-    is done."""
+    pose of frame `first`; none where no child costs less than all of them. The views are a toss's frames alone, not a
+    model's. `report` is told the share of the work that is done."""
     everyone, tried = list(hypotheses), set[Cut]()
     for done in range(config.rounds):
         report(done / config.rounds)
@@ -62,19 +69,16 @@ def crossed(
 
 
 def crossed_at(
-    one: TrajectoryHypothesis, other: TrajectoryHypothesis, cut: int, first: int, pose: Float[Array, "4 4"]
+    one: TrajectoryHypothesis, other: TrajectoryHypothesis, cut: int, first: int, best: Hypothesis
 ) -> TrajectoryHypothesis:
-    """One hypothesis up to and with frame `cut`, where both have a pose, and then as the other goes on from there;
-    through `pose` in frame `first`, if that has one. Not refined."""
-    n = len(one.use)
-    use, poses = np.where(np.arange(n) <= cut, one.use, other.use), one.joint.poses.copy()
-    own_from_other = np.linalg.inv(other.joint.poses[cut]) @ poses[cut]
-    poses[cut + 1 : n] = other.joint.poses[cut + 1 : n] @ own_from_other
-    if use[first]:
-        poses[:n] = poses[:n] @ (np.linalg.inv(poses[first]) @ pose)
-        poses[first] = pose
-    poses[:n][~use] = np.nan
-    return replace(one, use=use, estimated=replace(one.estimated, poses=poses), joint=replace(one.joint, poses=poses))
+    """One hypothesis up to and with frame `cut`, where both have a pose, and then as the other goes on from there; in
+    the object frame of the `best` one by frame `first`, if it has that. Not refined."""
+    after = np.arange(len(one.use)) > cut
+    use, poses = np.where(after, other.use, one.use), one.joint.poses.copy()
+    poses[after] = other.joint.poses[after] @ (np.linalg.inv(other.joint.poses[cut]) @ poses[cut])
+    poses[~use] = np.nan
+    estimated = anchored_to(replace(one.estimated, poses=poses), best, first)
+    return replace(one, use=use, estimated=estimated, joint=replace(one.joint, poses=estimated.poses))
 
 
 def cuts_between(
@@ -103,7 +107,7 @@ def _children(
 ) -> list[TrajectoryHypothesis]:  # fmt: skip
     """The children whose pairs cost least, no two alike and none like a parent; those `tried` are left out, and what
     is compared is added to them."""
-    n, pose = len(scene.times_s), everyone[0].joint.poses[first]
+    best = everyone[0].estimated
     costs = {i: _frame_costs(everyone[i]) for i in parents}
     cuts: list[tuple[float, Cut]] = []
     for a, b in permutations(parents, 2):
@@ -112,12 +116,12 @@ def _children(
                 cuts.append((float(costs[a][: cut + 1].sum() + costs[b][cut + 1 :].sum()), (a, b, cut)))
     likeliest = [cut for _, cut in sorted(cuts)[: config.compared]]
     tried.update(likeliest)
-    children = [crossed_at(everyone[a], everyone[b], cut, first, pose) for a, b, cut in likeliest]
+    children = [crossed_at(everyone[a], everyone[b], cut, first, best) for a, b, cut in likeliest]
     children.sort(key=lambda child: own_cost(scene, child, refinement))
     chosen: list[TrajectoryHypothesis] = []
-    known = [everyone[i].joint.poses[:n] for i in parents]
+    known = [everyone[i].joint.poses for i in parents]
     for child in children:
-        poses = child.joint.poses[:n]
+        poses = child.joint.poses
         if len(chosen) < config.refined and all(apart_deg(poses, k) > refinement.agreeing_deg for k in known):
             chosen.append(child)
             known.append(poses)
@@ -126,6 +130,6 @@ def _children(
 
 def _frame_costs(hypothesis: TrajectoryHypothesis) -> Float[Array, " n"]:
     """What each frame's pairs cost, `NO_POSE` where it has none."""
-    n, joint = len(hypothesis.use), hypothesis.joint
-    cost = per_view(joint.pairs, joint.figures, len(joint.poses))[0][:n]
+    joint = hypothesis.joint
+    cost = per_view(joint.pairs, joint.figures, len(joint.poses))[0]
     return np.where(hypothesis.use & np.isfinite(cost), cost, NO_POSE)

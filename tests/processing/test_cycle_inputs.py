@@ -215,10 +215,12 @@ def two_objects(tiny_world: Any, tmp_path_factory: pytest.TempPathFactory) -> tu
 
 @pytest.fixture(scope="module")
 def one_lost(tiny_world: Any, tmp_path_factory: pytest.TempPathFactory) -> Results:
-    """As `two_objects`, and the second toss shows too little for a shape of its own."""
+    """As `two_objects`, in both scopes, and the second toss shows too little for a shape of its own."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("processing.pipeline.first_pass.own_shape", lambda *_: None)
-        return run_on_two_objects(tiny_world, tmp_path_factory.mktemp("objects"), patch)[1]
+        session, results = run_on_two_objects(tiny_world, tmp_path_factory.mktemp("objects"), patch)
+        assert main([str(session), "--scope", "one", "--out", str(results.path)]) == 0
+    return Results.open(results.path)
 
 
 def test_a_toss_of_another_object_keeps_its_own_track_and_shape_and_is_not_learned_from(
@@ -245,9 +247,17 @@ def test_a_toss_of_another_object_that_shows_no_shape_of_its_own_is_lost_and_cou
     assert not tracks[0].lost.any()
     document = json.loads((one_lost.path / "table.json").read_text())
     assert [t["lost"] for t in document["rows"][0]["per_toss"]] == [0, 5]
-    contact = [stage_document(p)["counts"] for p in one_lost.path.glob("contact-*/stage.json")]
+    stages = [stage_document(p) for p in one_lost.path.glob("contact-*/stage.json")]
+    contact = [stage["counts"] for stage in stages if "track_01" in stage["inputs"]]  # of both tosses together
+    assert contact
     assert all("toss 1" in c["kept_out"] if c["kept_out"] else "1" in c["left_out"] for c in contact)
     assert np.ptp(one_lost.shape("ours", "all").vertices_m, axis=0).max() < 0.12
+
+
+def test_a_lost_toss_stays_lost_in_scope_one(one_lost: Results) -> None:
+    tracks = one_lost.tracks("ours", "one")
+    assert tracks[1].lost.all()
+    assert not tracks[0].lost.any()
 
 
 def test_the_second_pass_leaves_a_lost_toss_as_it_was_and_judges_the_others(one_lost: Results) -> None:

@@ -167,14 +167,14 @@ def test_a_child_is_one_parent_up_to_the_cut_and_moves_as_the_other_from_there_o
 ) -> None:
     one, other = both_half_wrong(scene, tiny_world)
     other = replace(other, use=np.arange(FRAMES) != IMPACT + 2)
-    poses = crossed_at(one, other, IMPACT, 0, one.joint.poses[0]).estimated.poses
+    poses = crossed_at(one, other, IMPACT, 0, one.estimated).estimated.poses
     np.testing.assert_allclose(poses[: IMPACT + 1], one.joint.poses[: IMPACT + 1], atol=1e-12)
     after = [p[IMPACT + 3 :] @ np.linalg.inv(p[IMPACT]) for p in (poses, other.joint.poses)]  # in camera axes
     np.testing.assert_allclose(after[0], after[1], atol=1e-12)
     assert np.flatnonzero(~np.isfinite(poses[:, 0, 0])).tolist() == [IMPACT + 2]
-    pose = one.joint.poses[0].copy()
-    pose[:3, :3] = pose[:3, :3] @ rotation_exp(np.array([0.1, 0.2, 0.3]))
-    np.testing.assert_array_equal(crossed_at(one, other, IMPACT, 0, pose).estimated.poses[0], pose)
+    moved = replace(one.estimated, poses=one.estimated.poses.copy())
+    moved.poses[0, :3, :3] = moved.poses[0, :3, :3] @ rotation_exp(np.array([0.1, 0.2, 0.3]))
+    np.testing.assert_array_equal(crossed_at(one, other, IMPACT, 0, moved).estimated.poses[0], moved.poses[0])
 
 
 def test_hypotheses_that_differ_on_one_side_only_are_not_cut(scene: Scene, tiny_world: Any) -> None:
