@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from processing.segment.background.foreground import fill_holes, largest_component, shadow_distance
+from processing.segment.background.moving_camera import picture_shifts
 from processing.segment.background.segmenter import BackgroundSegmenter, BackgroundSettings
 from processing.segment.background.static_scene import (
     SceneSettings,
@@ -143,6 +144,30 @@ def test_a_camera_that_moves_is_refused(tiny_world: Any) -> None:
 
     with pytest.raises(BadInput, match="this camera seems to move"):
         learn_scene([moved(i) for i in range(-4, 5)], None, SceneSettings())
+
+
+def _checkered(rng: np.random.Generator, height: int, width: int, size: int) -> Any:
+    return np.kron(rng.integers(0, 256, (height // size, width // size)), np.ones((size, size))).astype(np.uint8)
+
+
+def test_a_patterned_object_that_moves_before_a_plain_room_is_no_moving_camera() -> None:
+    pattern = _checkered(np.random.default_rng(3), 66, 66, 6)
+
+    def seen(shift: int, marks: bool) -> Any:
+        room = np.full((240, 320), 90, dtype=np.uint8)
+        for row, column in np.ndindex(4, 4) if marks else ():
+            room[row * 60 + 25 : row * 60 + 29, column * 80 + 35 : column * 80 + 39] = 150
+        room[85:151, 120 + shift : 186 + shift] = pattern
+        return np.repeat(room[..., None], 3, axis=2)
+
+    assert max(picture_shifts([seen(s, True) for s in (0, 3, 6)], None)) < 0.5
+    assert np.isnan(picture_shifts([seen(s, False) for s in (0, 3, 6)], None)).all()  # nothing of the room is followed
+
+
+def test_a_picture_that_shifts_as_a_whole_is_seen_to() -> None:
+    wide = _checkered(np.random.default_rng(4), 240, 352, 8)
+    shifts = picture_shifts([np.repeat(wide[:, s : s + 320, None], 3, axis=2) for s in (0, 2, 5)], None)
+    np.testing.assert_allclose(shifts, [2, 0, 3], atol=0.2)
 
 
 def test_images_that_change_their_size_are_refused(tiny_world: Any) -> None:

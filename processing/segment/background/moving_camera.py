@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float32, UInt8
+from jaxtyping import Bool, Float32, Int, UInt8
 from numpy import ndarray as Array
 
 from recordings.errors import BadInput
@@ -36,15 +36,18 @@ SAME_SCENE = 0.6
 CORNERS = 250
 LEAST_CORNERS = 40
 STILL_SHARE = 0.25
-"""So many of the corners at least are on what stands still."""
+"""On so much of the picture at least the corners are on what stands still."""
+CELLS, LEAST_CELLS = (9, 12), 20
+"""The picture is looked at in so many rows and columns of cells, each of which counts once: the corners of a patterned
+object before a plain room are many, but lie together. With corners in fewer cells nothing can be told."""
 FOLLOW: Mapping[str, Any] = {"winSize": (21, 21), "maxLevel": 3}
 
 
 def picture_shifts(colors: Sequence[UInt8[Array, "h w 3"]], hidden: Sequence[Bool[Array, "h w"]] | None) -> list[float]:
     """How far the picture as a whole has shifted (px) from the middle frame; NaN where too little can be followed.
 
-    It is the first quartile of the followed corners' distances: before a plain room most corners lie on what really
-    moves, an object, a hand, an arm; when the camera moves, all do.
+    It is the first quartile over the picture's cells of the followed corners' distances: before a plain room most
+    corners lie on what really moves, an object, a hand, an arm; when the camera moves, all do.
     """
     middle = len(colors) // 2
     others = colors[:: max(1, len(colors) // 16)]
@@ -94,13 +97,21 @@ def _grey(color_rgb: UInt8[Array, "h w 3"]) -> UInt8[Array, "h w"]:
 def _corners(
     color_rgb: UInt8[Array, "h w 3"], hidden: Bool[Array, "h w"] | None
 ) -> tuple[UInt8[Array, "h w"], Float32[Array, "n 1 2"] | None]:
-    """The picture in grey, and its corners; None where there are too few."""
+    """The picture in grey, and its corners; None where there are too few or where they lie together."""
     import cv2
 
     grey = _grey(color_rgb)
     free = None if hidden is None else np.where(hidden, 0, 255).astype(np.uint8)
     corners = cv2.goodFeaturesToTrack(grey, CORNERS, 0.01, 6, mask=free)
-    return grey, None if corners is None or len(corners) < LEAST_CORNERS else np.asarray(corners)
+    if corners is None or len(corners) < LEAST_CORNERS:
+        return grey, None
+    return grey, np.asarray(corners) if len(np.unique(_cells(grey, corners))) >= LEAST_CELLS else None
+
+
+def _cells(grey: UInt8[Array, "h w"], corners: Float32[Array, "n 1 2"]) -> Int[Array, " n"]:
+    """The number of each corner's cell of the picture."""
+    row, column = (corners[:, 0, ::-1] * CELLS / grey.shape).astype(np.int64).T
+    return np.asarray(row * CELLS[1] + column)
 
 
 def _shift(reference: UInt8[Array, "h w"], other: UInt8[Array, "h w"], corners: Float32[Array, "n 1 2"]) -> float:
@@ -112,4 +123,5 @@ def _shift(reference: UInt8[Array, "h w"], other: UInt8[Array, "h w"], corners: 
     good = followed & (np.linalg.norm(np.asarray(back) - corners, axis=-1).ravel() < 0.5)
     if good.sum() < LEAST_CORNERS:
         return float("nan")
-    return float(np.quantile(np.linalg.norm(np.asarray(there) - corners, axis=-1).ravel()[good], STILL_SHARE))
+    shifts, cells = np.linalg.norm(np.asarray(there) - corners, axis=-1).ravel()[good], _cells(reference, corners)[good]
+    return float(np.quantile([np.median(shifts[cells == cell]) for cell in np.unique(cells)], STILL_SHARE))
