@@ -19,7 +19,7 @@ from processing.segment.background.static_scene import (
 from processing.store import Done
 from recordings.records import RgbdFrame
 
-VERSION = 8
+VERSION = 9
 
 
 @dataclass(frozen=True)
