@@ -170,6 +170,35 @@ def test_a_picture_that_shifts_as_a_whole_is_seen_to() -> None:
     np.testing.assert_allclose(shifts, [2, 0, 3], atol=0.2)
 
 
+def test_a_picture_that_turns_about_its_middle_is_seen_to() -> None:
+    import cv2
+
+    room = _checkered(np.random.default_rng(4), 240, 320, 8)
+
+    def turned(degrees: float) -> Any:
+        turn = cv2.getRotationMatrix2D((160, 120), degrees, 1.0)
+        return np.repeat(cv2.warpAffine(room, turn, (320, 240))[..., None], 3, axis=2)
+
+    one, none, two = picture_shifts([turned(d) for d in (-2, 0, 3)], None)
+    assert none < 0.1
+    assert one > 1.5
+    assert two > one
+
+
+def test_corners_that_slide_along_stripes_tell_of_no_moving_camera() -> None:
+    rng = np.random.default_rng(7)
+
+    def slid(most: int) -> Any:
+        cloth = np.full((240, 320), 90, dtype=np.uint8)
+        for row, column in np.ndindex(10, 10):
+            left = 14 + column * 30 + int(rng.integers(-most, most + 1))
+            cloth[row * 24 + 8 : row * 24 + 16, left : left + 8] = 150
+        return np.repeat(cloth[..., None], 3, axis=2)
+
+    pictures = [slid(9), slid(0), slid(9)]
+    assert np.isnan(picture_shifts(pictures, None)).tolist() == [True, False, True]
+
+
 def test_images_that_change_their_size_are_refused(tiny_world: Any) -> None:
     frame, _ = tiny_world.see(None)
     smaller = replace(frame, color_rgb=frame.color_rgb[::2, ::2], depth_m=frame.depth_m[::2, ::2])

@@ -33,18 +33,23 @@ def refuse_moving_camera(colors: Sequence[UInt8[Array, "h w 3"]], hidden: Sequen
 MOVED_PX = 1.5
 SAME_SCENE = 0.6
 """Another toss shows the same scene where so much of its depth agrees; object, hand and robot come and go."""
+SAME_PICTURE = 0.5
+"""Least correlation with a picture of the same scene, where no corners can be followed into it."""
 CORNERS = 250
 LEAST_CORNERS = 40
 STILL_SHARE = 0.25
 """On so much of the picture at least the corners are on what stands still."""
 CELLS, LEAST_CELLS = (9, 12), 20
 """The picture is looked at in so many rows and columns of cells, each of which counts once: the corners of a patterned
-object before a plain room are many, but lie together. With corners in fewer cells nothing can be told."""
+object before a plain room are many, but lie together. Where fewer cells are followed nothing can be told."""
+ALIKE = 0.5
+"""More than half of the cells shift alike, but for this share of the shift, or nothing can be told: what lies near a
+camera shifts more than what lies far, but corners on stripes slide along them, each by another length."""
 FOLLOW: Mapping[str, Any] = {"winSize": (21, 21), "maxLevel": 3}
 
 
 def picture_shifts(colors: Sequence[UInt8[Array, "h w 3"]], hidden: Sequence[Bool[Array, "h w"]] | None) -> list[float]:
-    """How far the picture as a whole has shifted (px) from the middle frame; NaN where too little can be followed.
+    """How far the picture as a whole has shifted (px) from the middle frame; NaN where nothing can be told.
 
     It is the first quartile over the picture's cells of the followed corners' distances: before a plain room most
     corners lie on what really moves, an object, a hand, an arm; when the camera moves, all do.
@@ -69,14 +74,24 @@ def why_other_scene(
     grey, corners = _corners(reference.color_rgb, None if hidden is None else hidden[0])
     shifts = [] if corners is None else [_shift(grey, _grey(f.color_rgb), corners) for f in others]
     if shifts and np.isnan(shifts).all():
-        return "its picture has nothing in common with theirs"
-    if shifts and np.nanmax(shifts) >= MOVED_PX / 2:
+        if max(_correlation(grey, _grey(f.color_rgb)) for f in others) < SAME_PICTURE:
+            return "its picture has nothing in common with theirs"
+    elif shifts and np.nanmax(shifts) >= MOVED_PX / 2:
         return f"the camera was moved (its picture is shifted by {np.nanmax(shifts):.1f} px)"
     covered = [np.zeros(grey.shape, dtype=bool)] * (len(others) + 1) if hidden is None else hidden
     alike = [_share_alike(reference, f, covered[0] | h) for f, h in zip(others, covered[1:], strict=True)]
     if np.median(alike) < SAME_SCENE:
         return f"its depth shows another scene ({100 * np.median(alike):.0f} % of it agree)"
     return None
+
+
+def _correlation(one: UInt8[Array, "h w"], two: UInt8[Array, "h w"]) -> float:
+    """Of two pictures without what is finer than noise, -1 to 1."""
+    import cv2
+
+    size = (one.shape[1] // 8, one.shape[0] // 8)
+    small = [cv2.resize(picture, size, interpolation=cv2.INTER_AREA).astype(np.float32) for picture in (one, two)]
+    return float(cv2.matchTemplate(*small, cv2.TM_CCOEFF_NORMED)[0, 0])
 
 
 def _share_alike(reference: RgbdFrame, other: RgbdFrame, hidden: Bool[Array, "h w"]) -> float:
@@ -97,15 +112,13 @@ def _grey(color_rgb: UInt8[Array, "h w 3"]) -> UInt8[Array, "h w"]:
 def _corners(
     color_rgb: UInt8[Array, "h w 3"], hidden: Bool[Array, "h w"] | None
 ) -> tuple[UInt8[Array, "h w"], Float32[Array, "n 1 2"] | None]:
-    """The picture in grey, and its corners; None where there are too few or where they lie together."""
+    """The picture in grey, and its corners; None where there are too few."""
     import cv2
 
     grey = _grey(color_rgb)
     free = None if hidden is None else np.where(hidden, 0, 255).astype(np.uint8)
     corners = cv2.goodFeaturesToTrack(grey, CORNERS, 0.01, 6, mask=free)
-    if corners is None or len(corners) < LEAST_CORNERS:
-        return grey, None
-    return grey, np.asarray(corners) if len(np.unique(_cells(grey, corners))) >= LEAST_CELLS else None
+    return grey, None if corners is None or len(corners) < LEAST_CORNERS else np.asarray(corners)
 
 
 def _cells(grey: UInt8[Array, "h w"], corners: Float32[Array, "n 1 2"]) -> Int[Array, " n"]:
@@ -115,6 +128,26 @@ def _cells(grey: UInt8[Array, "h w"], corners: Float32[Array, "n 1 2"]) -> Int[A
 
 
 def _shift(reference: UInt8[Array, "h w"], other: UInt8[Array, "h w"], corners: Float32[Array, "n 1 2"]) -> float:
+    """NaN where too little is followed or where what shifts does not shift as one picture does.
+
+    A camera's own motion moves the picture by a similarity, but for parallax (`ALIKE`).
+    """
+    import cv2
+
+    before, after = _followed(reference, other, corners)
+    if len(before) < LEAST_CELLS:
+        return float("nan")
+    shift = float(np.quantile(np.linalg.norm(after - before, axis=1), STILL_SHARE))
+    near = max(MOVED_PX / 2, ALIKE * shift)
+    cv2.setRNGSeed(0)
+    _, alike = cv2.estimateAffinePartial2D(before, after, ransacReprojThreshold=near)
+    return shift if shift < MOVED_PX / 2 or np.mean(alike) > 0.5 else float("nan")
+
+
+def _followed(
+    reference: UInt8[Array, "h w"], other: UInt8[Array, "h w"], corners: Float32[Array, "n 1 2"]
+) -> tuple[Float32[Array, "k 2"], Float32[Array, "k 2"]]:
+    """Where each cell's corners lie (px, their median) in both pictures; of those found there and back again."""
     import cv2
 
     there, found, _ = cv2.calcOpticalFlowPyrLK(reference, other, corners, corners.copy(), **FOLLOW)
@@ -122,6 +155,7 @@ def _shift(reference: UInt8[Array, "h w"], other: UInt8[Array, "h w"], corners: 
     followed = (np.asarray(found) > 0).ravel() & (np.asarray(again) > 0).ravel()
     good = followed & (np.linalg.norm(np.asarray(back) - corners, axis=-1).ravel() < 0.5)
     if good.sum() < LEAST_CORNERS:
-        return float("nan")
-    shifts, cells = np.linalg.norm(np.asarray(there) - corners, axis=-1).ravel()[good], _cells(reference, corners)[good]
-    return float(np.quantile([np.median(shifts[cells == cell]) for cell in np.unique(cells)], STILL_SHARE))
+        return np.zeros((0, 2), dtype=np.float32), np.zeros((0, 2), dtype=np.float32)
+    cells, pair = _cells(reference, corners)[good], np.concatenate([corners, np.asarray(there)], axis=1)[good]
+    medians = np.array([np.median(pair[cells == cell], axis=0) for cell in np.unique(cells)], dtype=np.float32)
+    return np.ascontiguousarray(medians[:, 0]), np.ascontiguousarray(medians[:, 1])

@@ -19,7 +19,7 @@ from processing.segment.background.static_scene import (
 from processing.store import Done
 from recordings.records import RgbdFrame
 
-VERSION = 9
+VERSION = 10
 
 
 @dataclass(frozen=True)

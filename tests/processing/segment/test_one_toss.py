@@ -102,6 +102,12 @@ def test_another_camera_place_and_another_room_are_told(tiny_world: Any) -> None
     assert "another scene" in str(why_other_scene(seen, [replace(seen, depth_m=depth + 0.3)], None))
     smaller = replace(seen, color_rgb=room[::2, ::2], depth_m=depth[::2, ::2])
     assert "another size" in str(why_other_scene(seen, [smaller], None))
+    other_cloth = np.kron(rng.integers(0, 255, (30, 40, 3)), np.ones((6, 6, 1))).astype(np.uint8)
+    assert "nothing in common" in str(why_other_scene(seen, [replace(seen, color_rgb=other_cloth)], None))
+    coarse = 100 + 60 * np.sin(np.arange(240) / 30) * np.cos(np.arange(180)[:, None] / 30)
+    grain = [np.kron(rng.integers(-30, 30, (90, 120)), np.ones((2, 2))) for _ in range(3)]
+    dark = [replace(seen, color_rgb=np.repeat((coarse + g).astype(np.uint8)[..., None], 3, axis=2)) for g in grain]
+    assert why_other_scene(dark[0], dark[1:], None) is None  # noise is all that could be followed
 
 
 def _run(session: Path, tosses: list[int], out: Path) -> Run:
