@@ -90,8 +90,8 @@ def _correlation(one: UInt8[Array, "h w"], two: UInt8[Array, "h w"]) -> float:
     import cv2
 
     size = (one.shape[1] // 8, one.shape[0] // 8)
-    small = [cv2.resize(picture, size, interpolation=cv2.INTER_AREA).astype(np.float32) for picture in (one, two)]
-    return float(cv2.matchTemplate(*small, cv2.TM_CCOEFF_NORMED)[0, 0])
+    small_one, small_two = (cv2.resize(picture, size, interpolation=cv2.INTER_AREA) for picture in (one, two))
+    return float(cv2.matchTemplate(small_one, small_two, cv2.TM_CCOEFF_NORMED)[0, 0])
 
 
 def _share_alike(reference: RgbdFrame, other: RgbdFrame, hidden: Bool[Array, "h w"]) -> float:
