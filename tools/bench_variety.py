@@ -34,9 +34,10 @@ from variety import marks, seeds, session
 from variety.colour import blender
 from variety.seeds import Case
 from variety.shapes import FAMILIES
-from variety.spec import draw
+from variety.spec import Spec, draw
 from variety.table import table
 
+from acquisition.synthetic.truth_sidecar import SUFFIX
 from recordings.errors import BadInput, TosslabError
 from recordings.importers.folder import import_folder
 from recordings.progress import Console
@@ -84,6 +85,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--variant", choices=VARIANTS, default=VARIANTS[0], help="beside the frame-to-model baseline")
     parser.add_argument("--out", type=Path, default=None, help="where results stay (default out/variety/SPLIT)")
     parser.add_argument("--resume", action="store_true", help="go on with what is in --out")
+    parser.add_argument(
+        "--sessions", type=Path, help="keep sessions there, and take those that are kept (made by the same generator)"
+    )
     parser.add_argument("--threads", type=int, default=2, help="of the path tracer")
     return parser
 
@@ -108,6 +112,8 @@ def _make_one(given: argparse.Namespace) -> int:
 
 
 def _bench(given: argparse.Namespace) -> int:
+    if given.sessions is not None and given.objects is not None:
+        raise BadInput("--sessions keeps sessions of drawn objects; wanted it without --objects")
     out = given.out or ROOT / "out" / "variety" / given.split
     rows_folder = out / "rows"
     if rows_folder.exists() and not given.resume:
@@ -142,7 +148,7 @@ def run_case(case: Case, work: Path, given: argparse.Namespace) -> dict[str, Any
     work.mkdir(parents=True)
     folder, began, cpu = work / case.name, time.time(), _cpu_s()
     try:
-        truth = session.make(spec, folder, given.objects, Console(case.name), given.threads)
+        folder, truth = _made(spec, folder, given)
         row["made"] = {"wall_s": round(time.time() - began, 1), "cpu_s": round(_cpu_s() - cpu, 1)}
         row["physics"] = json.loads((truth / "physics.json").read_text())
         imported = work / "imported" / case.name
@@ -159,6 +165,22 @@ def run_case(case: Case, work: Path, given: argparse.Namespace) -> dict[str, Any
     finally:
         shutil.rmtree(work, ignore_errors=True)
     return row
+
+
+def _made(spec: Spec, folder: Path, given: argparse.Namespace) -> tuple[Path, Path]:
+    """A session and its truth: the one that is kept, where there is one of this spec, or else made in `folder`."""
+    if given.sessions is None:
+        return folder, session.make(spec, folder, given.objects, Console(spec.name), given.threads)
+    kept = given.sessions / spec.name
+    truth = kept.with_name(spec.name + SUFFIX)
+    told = truth / "spec.json"
+    if not (kept.exists() and told.exists() and json.loads(told.read_text()) == json.loads(json.dumps(spec.to_json()))):
+        made = session.make(spec, folder, given.objects, Console(spec.name), given.threads)
+        given.sessions.mkdir(parents=True, exist_ok=True)
+        for source, to in ((folder, kept), (made, truth)):
+            shutil.rmtree(to, ignore_errors=True)
+            shutil.move(source, to)
+    return kept, truth
 
 
 def _processed(imported: Path, truth: Path, out: Path, options: Sequence[str]) -> Mapping[str, Any]:

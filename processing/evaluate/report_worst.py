@@ -135,7 +135,7 @@ def reasons(e: TossDiagnostics, i: int) -> tuple[str, ...]:
     """What is unusual about a frame, beside what is usual in its toss; never empty."""
     said = [*_of_the_mask(e, i), *_of_the_fit(e, i), *_of_the_motion(e, i)]
     if e.track.status[i] == "interpolated":
-        said.insert(0, "its pose is interpolated between its neighbours")
+        said.insert(0, "its pose is not sure, or one between its neighbours")
     return tuple(said) or ("nothing that was measured is unusual in it",)
 
 

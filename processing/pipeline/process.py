@@ -17,7 +17,7 @@ from processing.pipeline.record import write_record
 from processing.run import Run, each, with_noise
 from processing.stages.field import learn_field
 from processing.stages.find import find_object
-from processing.stages.lose import lose, without_lost
+from processing.stages.lose import without_lost
 from processing.stages.model import bring_model
 from processing.stages.recording.depth_delay import with_depth_in_time
 from processing.stages.recording.noise import measure_noise
@@ -45,14 +45,14 @@ def process(run: Run, variant: Variant, scope: Scope, model: Path | None = None)
     run = replace(with_noise(run, noise.result.noise), warnings=(*run.warnings, *say.of_noise(noise)))
     run = without_lost(run, masks)
     images = {t: raw_images(run, t, rig, masks[t]) for t in run.tosses}
+    alone = tracked_alone(run, images) if model is None else {}
     if model is not None:
         last = with_model(run, images, model)
     elif variant.first == "one_toss":
-        last = one_by_one(run, tracked_alone(run, images), images, scope)
+        last = one_by_one(run, alone, images, scope)
     else:
-        last = together(run, variant, scope, tracked_alone(run, images), images)
-    lost = {t: lose(run, t, masks[t]) for t in run.lost}
-    return write_record(run, variant, scope, last, lost, scene, rig, masks)
+        last = together(run, variant, scope, alone, images)
+    return write_record(run, variant, scope, last, alone, scene, rig, masks)
 
 
 def all_masks(run: Run, scene: Done, rig: Done, found: Done | None) -> dict[int, Done]:

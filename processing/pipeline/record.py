@@ -9,9 +9,11 @@ from processing.pipeline import notices as say
 from processing.pipeline.passes import Pass
 from processing.run import Run
 from processing.segment.background.depth_scale import posterior_sigma
+from processing.stages.lose import lose
 from processing.stages.recording.every_frame import masks_in_every_frame, poses_in_every_frame
 from processing.stages.recording.rig import RigResult
 from processing.stages.recording.scene import SceneResult, scene_notes
+from processing.stages.register import RegisterResult
 from processing.stages.segment import SegmentResult
 from processing.store import Done, locked
 from processing.variants import Variant
@@ -20,17 +22,25 @@ from recordings.results.folder import Scope, TossRecord, VariantRecord, write_va
 
 
 def write_record(
-    run: Run, variant: Variant, scope: Scope, last: Pass, lost: Mapping[int, Done], scene: Done[SceneResult],
+    run: Run, variant: Variant, scope: Scope, last: Pass, alone: Mapping[int, Done], scene: Done[SceneResult],
     rig: Done[RigResult], masks: Mapping[int, Done[SegmentResult]],
 ) -> VariantRecord:  # fmt: skip
-    """variants/<name>.<scope>.json. A toss in `lost` has no pose; its shape is said to be that of the first toss."""
+    """variants/<name>.<scope>.json. `alone`: each toss's first pass, where there is one. A lost toss has no pose; its
+    shape is said to be that of the first toss."""
+    lost = {t: lose(run, t, masks[t]) for t in run.lost}
     tracks, shapes = {**last.tracks, **lost}, {**last.shapes, **dict.fromkeys(lost, last.shape)}
     scale_sigma, first = posterior_sigma(rig.result.scale_sigma, run.config.rig.scale), min(last.tracks)
-    tosses = tuple(
-        TossRecord(t, poses_in_every_frame(run, t, tracks[t], (first, tracks[first]), scale_sigma).name, shapes[t].name,
-                   masks_in_every_frame(run, t, masks[t]).name)
-        for t in run.recorded
-    )  # fmt: skip
+    together = [t for t, done in alone.items() if t in last.tracks and last.tracks[t].key != done.key]
+    on_shape = {t: alone[t] for t in together if not isinstance(last.tracks[t].result, RegisterResult)}
+
+    def of_toss(t: int) -> TossRecord:
+        poses = poses_in_every_frame(
+            run, t, tracks[t], (first, tracks[first]), scale_sigma, on_shape.get(t),
+            len(together) if scope == "all" else 1,
+        )  # fmt: skip
+        return TossRecord(t, poses.name, shapes[t].name, masks_in_every_frame(run, t, masks[t]).name)
+
+    tosses = tuple(of_toss(t) for t in run.recorded)
     contact = {str(t): done.name for t, done in last.contact.items()}
     of_stages = [*say.of_run(run, rig, masks), *(n for done in last.contact.values() for n in say.of_contact(done))]
     record = VariantRecord(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import groupby
 
 import numpy as np
@@ -16,7 +16,7 @@ from processing.sensor import view_layout as lay
 from processing.sensor.view_store import ViewStore
 from processing.track.beam import Scene
 from recordings.geometry import rotation_log, skew
-from recordings.tracks import Status
+from recordings.tracks import ObjectTrack, Status
 
 
 @dataclass(frozen=True)
@@ -192,6 +192,44 @@ def _in_gap(
     if not held:
         pose[:3, 3] -= 0.5 * scene.gravity_camera_m_s2 * whole**2 * share * (1 - share)
     return pose
+
+
+SURE_DEG, SURE_M = 5.0, 0.02
+"""What a published `tracked` promises: standard deviations of a pose's rotation and place below these, of which the
+first is the field's limit of a right pose (5 degrees, 5 cm). Inside, surer than `FlagConfig.unsure_deg` will do."""
+
+
+def with_shape_error(track: ObjectTrack, alone: ObjectTrack, tosses: int) -> ObjectTrack:
+    """The track of a toss on a shape, its covariances with the error of that shape.
+
+    The shape was fused from the tosses' first passes (`alone`: this toss's) and repeats their errors, so that no
+    alignment to it takes them away. Those of so many `tosses` are independent: of their mean, the variance is one in
+    `tosses` of each. Frames that were lost alone are as unsure as its others in the mean.
+    """
+    posed = ~track.lost
+    known = posed & ~alone.lost & np.isfinite(alone.covariance).all(axis=(1, 2))
+    if not known.any():
+        return track
+    to = np.tile(np.eye(6), (int(known.sum()), 1, 1))  # both frames' origins are fixed to the body
+    lever = track.camera_from_object[known, :3, 3] - alone.camera_from_object[known, :3, 3]
+    to[:, 3:, :3] = [-skew(arm) for arm in lever]
+    errors = np.empty_like(track.covariance)
+    errors[known] = to @ alone.covariance[known] @ to.transpose(0, 2, 1)
+    errors[~known] = errors[known].mean(axis=0)
+    covariance = track.covariance.copy()
+    covariance[posed] += errors[posed] / tosses
+    return replace(track, covariance=covariance)
+
+
+def published(track: ObjectTrack) -> ObjectTrack:
+    """The track, `tracked` only where it is as sure as that promises; what is not known of a covariance is no doubt."""
+    status = list(track.status)
+    for i, covariance in enumerate(track.covariance):
+        if status[i] == "tracked" and np.isfinite(covariance).all():
+            turn, place = (np.linalg.eigvalsh(covariance[a : a + 3, a : a + 3])[-1] for a in (0, 3))
+            if turn > np.radians(SURE_DEG) ** 2 or place > SURE_M**2:
+                status[i] = "interpolated"
+    return replace(track, status=tuple(status))
 
 
 def camera_covariance(pose: Float[Array, "4 4"], twist_covariance: Float[Array, "6 6"]) -> Float[Array, "6 6"]:

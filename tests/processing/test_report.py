@@ -229,7 +229,7 @@ def test_a_reason_names_what_is_unusual_and_nothing_else(made, name, value, said
     arrays[name][1] = value
     assert len(found := reasons(calm, 1)) == 1
     assert said in found[0]
-    assert reasons(calm, GUESSED)[0] == "its pose is interpolated between its neighbours"
+    assert reasons(calm, GUESSED)[0] == "its pose is not sure, or one between its neighbours"
 
 
 def test_runs_of_lost_frames_are_found(made):

@@ -1,5 +1,5 @@
-"""Stage `every-frame`: what results say of every frame: masks and poses of those that were not worked on, too, and how
-far depth's scale may carry them all."""
+"""Stage `every-frame`: what results say of every frame: masks and poses of those that were not worked on, too, how far
+the shape's own error and depth's scale may carry them all, and which of them are sure."""
 
 from __future__ import annotations
 
@@ -16,11 +16,12 @@ from numpy import ndarray as Array
 from processing.run import Run
 from processing.sensor.still import Kept, whole_session
 from processing.store import Done
+from processing.track.flags import published, with_shape_error
 from recordings.results.folder import RobotMasks, read_masks, read_track, write_masks, write_track
 from recordings.results.track_notes import FIT, NOTES
 from recordings.tracks import ObjectTrack
 
-VERSION = 4
+VERSION = 5
 
 
 @dataclass(frozen=True)
@@ -31,16 +32,21 @@ class EveryFrameResult:
     worked_on: int
 
 
-def poses_in_every_frame(run: Run, toss: int, done: Done, first: tuple[int, Done], scale_sigma: float) -> Done:
+def poses_in_every_frame(
+    run: Run, toss: int, done: Done, first: tuple[int, Done], scale_sigma: float, alone: Done | None, tosses: int
+) -> Done:
     """A stage's track of one toss in every frame that was recorded. `first`: the toss that comes first, and its track;
-    `scale_sigma`: standard deviation of depth's scale. What the tracker noted of its frames goes with it where these
-    are all frames."""
+    `scale_sigma`: standard deviation of depth's scale; `alone`: the toss's first pass, where the track rests on a shape
+    that was fused from the first passes of so many `tosses`. What the tracker noted of its frames goes with it where
+    these are all frames."""
     kept = run.kept.get(toss)
     inputs = {f"track_{toss:02d}": done.key} if kept is None else {"thinned": done.key, "kept": kept.digest}
-    inputs |= {"first": first[1].key}
+    inputs |= {"first": first[1].key} | ({} if alone is None else {"alone": alone.key})
 
     def compute(folder: Path) -> EveryFrameResult:
         track = read_track(done.folder, toss)
+        if alone is not None:
+            track = with_shape_error(track, read_track(alone.folder, toss), tosses)
         defined = defining_pose(track, read_track(first[1].folder, first[0]))
         count = len(track.status)
         if kept is None:
@@ -52,10 +58,11 @@ def poses_in_every_frame(run: Run, toss: int, done: Done, first: tuple[int, Done
             status = tuple(track.status[i] for i in kept.like)
             poses, covariance = (x[kept.like] for x in (track.camera_from_object, track.covariance))
             track = replace(track, time_ns=times_ns, camera_from_object=poses, status=status, covariance=covariance)
-        write_track(folder, scaled_by_chance(track, defined, scale_sigma))
+        write_track(folder, published(scaled_by_chance(track, defined, scale_sigma)))
         return EveryFrameResult(len(track.status), count)
 
-    return _stage(run, {"toss": toss, "first": first[0], "scale_sigma": scale_sigma}, inputs, compute)
+    config = {"toss": toss, "first": first[0], "scale_sigma": scale_sigma, "tosses": tosses}
+    return _stage(run, config, inputs, compute)
 
 
 def masks_in_every_frame(run: Run, toss: int, done: Done) -> Done:

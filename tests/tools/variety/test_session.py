@@ -135,7 +135,7 @@ def bench():
     return module
 
 
-ASKED = argparse.Namespace(tosses=1, objects=None, variant="ours", threads=1)
+ASKED = argparse.Namespace(tosses=1, objects=None, variant="ours", threads=1, sessions=None)
 
 
 @pytest.mark.parametrize(
@@ -154,6 +154,28 @@ def test_a_session_that_cannot_be_made_is_a_row_with_its_reason_and_leaves_nothi
     assert row["case"] == "choose-009"
     assert not (tmp_path / "work").exists()
     json.dumps(row)
+
+
+def test_a_kept_session_is_used_again_and_one_of_another_spec_is_made_anew(monkeypatch, tmp_path):
+    program, made = bench(), []
+
+    def make(spec, out, *_):
+        made.append(spec)
+        truth = out.with_name(f"{out.name}_truth")
+        out.mkdir(parents=True)
+        truth.mkdir()
+        (truth / "spec.json").write_text(json.dumps(spec.to_json()))
+        return truth
+
+    monkeypatch.setattr(program.session, "make", make)
+    asked, drawn = argparse.Namespace(**{**vars(ASKED), "sessions": tmp_path / "kept"}), small()
+    for wanted in (drawn, drawn, replace(drawn, tosses=("twice",))):
+        folder, truth = program._made(wanted, tmp_path / "work" / drawn.name, asked)
+        assert folder == tmp_path / "kept" / drawn.name
+        assert json.loads((truth / "spec.json").read_text()) == json.loads(json.dumps(wanted.to_json()))
+        assert not list((tmp_path / "work").iterdir())
+    assert len(made) == 2
+    assert made[0] != made[1]
 
 
 def test_what_a_run_cost_is_what_its_stages_cost(tmp_path):

@@ -1,4 +1,5 @@
-"""What depth's scale leaves open of poses: known answers of a camera whose depth is too long by a known factor."""
+"""What results say of how sure poses are: known answers of a camera whose depth is too long by a known factor, and of
+poses on a shape that repeats the errors of those that it was fused from."""
 
 from __future__ import annotations
 
@@ -9,6 +10,7 @@ import pytest
 
 from processing.segment.background.depth_scale import DepthScaleSettings, posterior_sigma
 from processing.stages.recording.every_frame import defining_pose, scaled_by_chance
+from processing.track.flags import SURE_DEG, SURE_M, camera_covariance, published, with_shape_error
 from recordings.geometry import rotation_exp
 from recordings.tracks import ObjectTrack
 
@@ -88,3 +90,51 @@ def test_the_scales_deviation_is_the_posteriors() -> None:
     assert posterior_sigma(0.01, settings) == pytest.approx(0.01 / np.sqrt(2))
     assert posterior_sigma(0.0004, settings) == pytest.approx(0.0004, rel=1e-3)
     assert posterior_sigma(0.0, settings) == 0.0
+
+
+def test_on_a_shape_a_track_is_as_unsure_as_the_first_passes_that_made_it() -> None:
+    """Drawn first passes of four tosses; the shape lies where they do in the mean, and a pose on it where the shape
+    does, in another object frame."""
+    rng, tosses, drawn = np.random.default_rng(2), 4, 4000
+    true = true_track()
+    twist = np.diag([2e-3, 1e-3, 3e-3, 0.03, 0.05, 0.02]) ** 2  # of the object frame: translation, rotation
+    pose, frame_from_own = true.camera_from_object[3], np.eye(4)
+    frame_from_own[:3, :3], frame_from_own[:3, 3] = rotation_exp(np.array([0.4, -0.2, 0.9])), [0.05, -0.03, 0.08]
+    cov = np.full((FRAMES, 6, 6), np.nan)
+    cov[:] = camera_covariance(pose, twist)
+    alone = replace(
+        true, camera_from_object=np.tile(pose, (FRAMES, 1, 1)), status=("tracked",) * FRAMES, covariance=cov
+    )
+    on_shape = replace(alone, camera_from_object=np.tile(pose @ frame_from_own, (FRAMES, 1, 1)), covariance=0 * cov)
+    errors = np.empty((drawn, 6))
+    for k, four in enumerate(rng.multivariate_normal(np.zeros(6), cov[0], size=(drawn, tosses))):
+        turn, shift = four[:, :3].mean(axis=0), four[:, 3:].mean(axis=0)
+        lever = (pose @ frame_from_own)[:3, 3] - pose[:3, 3]
+        errors[k] = np.r_[turn, shift + rotation_exp(turn) @ lever - lever]
+    claimed = with_shape_error(on_shape, alone, tosses).covariance[3]
+    scale = np.sqrt(np.outer(claimed.diagonal(), claimed.diagonal()))
+    np.testing.assert_allclose(claimed / scale, np.cov(errors.T) / scale, atol=0.08)
+
+
+def test_what_was_lost_alone_is_as_unsure_as_the_rest_in_the_mean_and_lost_poses_stay_lost() -> None:
+    alone = true_track()
+    poses = alone.camera_from_object.copy()
+    poses[7] = poses[6]
+    on_shape = replace(alone, camera_from_object=poses, status=("tracked",) * FRAMES)
+    grown = with_shape_error(on_shape, alone, 1).covariance - on_shape.covariance
+    np.testing.assert_allclose(grown[7], grown[np.arange(FRAMES) != 7].mean(axis=0), atol=1e-15)
+    still_lost = with_shape_error(alone, alone, 2)
+    np.testing.assert_array_equal(still_lost.covariance[7], alone.covariance[7])
+    nowhere = ObjectTrack.nowhere(0, "d455", alone.time_ns)
+    assert with_shape_error(alone, nowhere, 2) is alone
+
+
+@pytest.mark.parametrize(("turn_deg", "place_m", "sure"), [(0.9, 0.9, True), (1.1, 0.1, False), (0.1, 1.1, False)])
+def test_tracked_promises_five_degrees_and_two_centimetres(turn_deg: float, place_m: float, sure: bool) -> None:
+    track = true_track()
+    covariance = track.covariance.copy()
+    covariance[4] = np.diag([0, np.radians(SURE_DEG * turn_deg) ** 2, 0, 0, 0, (SURE_M * place_m) ** 2])
+    covariance[5] = np.nan  # not known
+    said = published(replace(track, covariance=covariance)).status
+    assert said[4] == ("tracked" if sure else "interpolated")
+    assert [s for i, s in enumerate(said) if i != 4] == [s for i, s in enumerate(track.status) if i != 4]
