@@ -88,9 +88,10 @@ class AzimuthConfig:
     """An appearance that would weigh less than this does; the search starts again."""
     spin_change_rad_s: float = 1.5
     """Usual change of spin from view to view, on the grid."""
-    fast_rad_s: float = 25.0
+    fast_rad_s: float = 34.6
     fast_cost: float = 100.0
-    """Spins above this cost their excess times this."""
+    """Spins above this cost their excess times this: at 30 Hz it turns a body by 66 degrees a frame, beyond which hardly
+    anything seen in one frame is seen in the next (`FlightConfig.most_turn_deg`)."""
     sweeps: int = 8
     longest: int = 12
     """Views of a run that are turned together."""
