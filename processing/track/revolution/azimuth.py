@@ -90,8 +90,8 @@ class AzimuthConfig:
     """Usual change of spin from view to view, on the grid."""
     fast_rad_s: float = 34.6
     fast_cost: float = 100.0
-    """Spins above this cost their excess times this: at 30 Hz it turns a body by 66 degrees a frame, beyond which hardly
-    anything seen in one frame is seen in the next (`FlightConfig.most_turn_deg`)."""
+    """Spins above this cost their excess times this: 66 degrees a frame at 30 Hz, beyond which hardly anything
+    seen in one frame is seen in the next (`FlightConfig.most_turn_deg`)."""
     sweeps: int = 8
     longest: int = 12
     """Views of a run that are turned together."""
