@@ -9,6 +9,7 @@ from typing import Any, Literal
 from processing.contact.friction.estimate import RESTITUTION_ASSUMED
 from processing.evaluate.learned_values import learned_values
 from processing.evaluate.score import TossScore, Value, VariantScore
+from processing.track.flags import SURE_DEG, SURE_M
 from processing.variants import ROWS, TABLE, WITH_MODEL
 from recordings.notices import Notice, in_order, said_of
 from recordings.results.folder import Results, VariantRecord
@@ -127,7 +128,8 @@ def _legend(rows: Sequence[dict[str, Any]]) -> list[str]:
     """What the columns mean, as far as they are there."""
     there = {name for row in rows for name in row["values"]}
     lines = [
-        "All frames of these tosses count; a lost one has an infinite error, also in a toss that is lost end to end.",
+        "All frames of these tosses count; a lost one has an infinite error, also in a toss that is lost end to end. "
+        f"Unsure (`interpolated`): a pose whose standard deviation exceeds {SURE_DEG:g} deg or {100 * SURE_M:g} cm.",
         "Poses are aligned per toss at its own first frame; a toss whose first frame is lost is not aligned. CD icp: "
         "after a further rigid alignment of the mesh.",
     ]
@@ -156,12 +158,12 @@ def _of_score(score: VariantScore | None) -> list[Notice]:
 
 def _block(rows: Sequence[dict[str, Any]]) -> list[str]:
     columns = [(name, title) for name, title in COLUMNS if name != "cd_floor" or any(name in r["values"] for r in rows)]
-    titles = ["variant", "tosses", "frames", "lost", *(title for _, title in columns)]
+    titles = ["variant", "tosses", "frames", "unsure", "lost", *(title for _, title in columns)]
     lines = ["| " + " | ".join(titles) + " |", "|---|" + "---:|" * (len(titles) - 1)]
     for row in rows:
         frames = sum(t["tracked"] + t["interpolated"] + t["lost"] for t in row["per_toss"])
-        lost = sum(t["lost"] for t in row["per_toss"])
-        cells = [row["variant"], _tosses(row), str(frames), str(lost)]
+        unsure, lost = (sum(t[s] for t in row["per_toss"]) for s in ("interpolated", "lost"))
+        cells = [row["variant"], _tosses(row), str(frames), str(unsure), str(lost)]
         lines.append("| " + " | ".join([*cells, *(_cell(row, name) for name, _ in columns)]) + " |")
     return lines
 
@@ -218,7 +220,7 @@ def write_table(results: Results, rows: Sequence[Row]) -> dict[str, Any]:
 
 def summary(documents: Sequence[dict[str, Any]]) -> str:
     """A line per session: its best row's scores, or why it failed; then what must be known of each."""
-    titles = ["session", "variant", "tosses", "lost", *(title for _, title in COLUMNS)]
+    titles = ["session", "variant", "tosses", "unsure", "lost", *(title for _, title in COLUMNS)]
     lines = ["| " + " | ".join(titles) + " |", "|---|---|" + "---:|" * (len(titles) - 2)]
     failed, whose = [], []
     for document in documents:
@@ -229,7 +231,8 @@ def summary(documents: Sequence[dict[str, Any]]) -> str:
         whose += [(str(document["session"]), Notice.from_json(n)) for r in rows for n in r["warnings"]]
         row = next((r for r in rows if r["variant"] == "ours"), rows[-1])
         cells = [str(document["session"]), row["variant"], str(len(row["tosses"]))]
-        cells += [str(sum(t["lost"] for t in row["per_toss"])), *(_cell({**row, "paper": None}, n) for n, _ in COLUMNS)]
+        cells += [str(sum(t[s] for t in row["per_toss"])) for s in ("interpolated", "lost")]
+        cells += [_cell({**row, "paper": None}, name) for name, _ in COLUMNS]
         lines.append("| " + " | ".join(cells) + " |")
     said_below = [*failed, *(f"- {line}" for line in said_of(whose, "every session", len(documents)))]
     return "\n".join([*lines, *([""] if said_below else []), *said_below])

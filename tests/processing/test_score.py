@@ -138,7 +138,7 @@ def test_true_poses_with_five_of_ten_tosses_lost_score_a_half(tmp_path: Path, te
 def test_a_lost_toss_is_lost_in_the_table_and_one_kept_apart_is_named(tmp_path: Path, ten: list[np.ndarray]) -> None:
     estimate = [lost(p) if i == 3 else p for i, p in enumerate(ten[:5])]
     table = written(tmp_path, ten[:5], estimate, apart=[1, 4]).table()
-    assert "| ours | 5 (lost: 3; apart: 1, 4) | 60 | 12 | 80.00 | 80.00 | 80.00 |" in table
+    assert "| ours | 5 (lost: 3; apart: 1, 4) | 60 | 0 | 12 | 80.00 | 80.00 | 80.00 |" in table
     assert "a toss whose first frame is lost is not aligned" in table
 
 
