@@ -99,11 +99,13 @@ def straight_between(
 def pose_at(track: ObjectTrack, position: int, time_ns: int) -> Float[Array, "4 4"]:
     """`camera_from_object` at a time near a frame's: moved along the way to the neighbour on that side, if tracked; on
     a parabola through both neighbours where nothing hits the object (in 16 ms a falling one leaves the straight way by
-    more than a millimetre)."""
+    more than a millimetre). NaN where the frame itself is lost."""
     here = track.camera_from_object[position]
     side = 1 if time_ns > track.time_ns[position] else -1
     other = position + side
-    if time_ns == track.time_ns[position] or not 0 <= other < len(track.status) or track.status[other] == "lost":
+    if time_ns == track.time_ns[position] or not 0 <= other < len(track.status):
+        return here
+    if "lost" in (track.status[position], track.status[other]):
         return here
     there = track.camera_from_object[other]
     share = (time_ns - int(track.time_ns[position])) / int(track.time_ns[other] - track.time_ns[position])

@@ -248,6 +248,16 @@ def test_the_pose_at_depths_exposure_lies_on_the_parabola():
     assert abs(before[1, 3] - (-1.2 * 0.016 + 0.5 * 9.81 * 0.016**2)) < 0.0015
 
 
+def test_a_lost_frame_has_no_pose_at_depths_exposure_either() -> None:
+    poses = np.tile(looking_at_cube(Rotation.from_rotvec([0.3, 0.2, 0.1])), (4, 1, 1))
+    poses[[1, 3]] = np.nan
+    times_ns, status = (np.arange(4) * 33_333_333).astype(np.int64), ("tracked", "lost", "tracked", "lost")
+    track = ObjectTrack(0, "d455", "object", times_ns, poses, status, np.zeros((4, 6, 6)))
+    for i in range(4):
+        for late_ns in (-9_000_000, 0, 16_000_000):
+            np.testing.assert_array_equal(pose_at(track, i, int(times_ns[i]) + late_ns), poses[i])
+
+
 def test_pieces_that_a_hand_cuts_apart_are_all_kept_and_crumbs_are_not() -> None:
     grid = fuse(cube_views(8), FuseConfig(truncation_m=0.005))
     sdf = np.full_like(grid.sdf_m, grid.voxel_m)
