@@ -70,7 +70,10 @@ def chosen_views(tosses: Sequence[TossViews], camera: CameraModel, config: Learn
     found = side_by_side(lambda place: _view(place[0], place[1], camera), chosen)
     views = [view for view in found if view is not None]
     if not views:
-        raise BadInput("no tracked frame shows the object, so there is nothing to learn a shape from")
+        raise BadInput(
+            "no frame has a pose that is sure, so there is nothing to learn a shape from; wanted at least one: look at "
+            "the masks with `toss-view`, give a first mask, or record closer and with more light"
+        )
     return views
 
 

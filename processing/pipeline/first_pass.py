@@ -12,7 +12,7 @@ import numpy as np
 
 from processing.images import Images
 from processing.pipeline import notices as say
-from processing.pipeline.cross_fit import cross_fitted, located_on, sure_alone
+from processing.pipeline.cross_fit import cross_fitted, fused, located_on, sure_alone
 from processing.pipeline.passes import Pass
 from processing.run import Run, each
 from processing.stages.field import learn_field
@@ -35,8 +35,8 @@ def first_pass(run: Run, alone: Mapping[int, Done], images: Mapping[int, Images]
     while True:
         placed = register(run, {t: alone[t] for t in tosses}, images)
         joined = [t for t in tosses if t not in placed.result.not_joined]
-        fused = fuse_frames(run, dict.fromkeys(joined, placed), images)
-        unexplained = kept_apart(run, placed, fused, images, joined)
+        shown = fuse_frames(run, dict.fromkeys(joined, placed), images)
+        unexplained = kept_apart(run, placed, shown, images, joined)
         if not unexplained:
             break
         alien, tosses = (*alien, *unexplained), tuple(t for t in tosses if t not in unexplained)
@@ -45,8 +45,8 @@ def first_pass(run: Run, alone: Mapping[int, Done], images: Mapping[int, Images]
     if found:  # the others have not been on a shape with what these show
         fitted = cross_fitted(run, images, {**fitted, **found}, {**alone, **found})
     left = [t for t in placed.result.not_joined if t not in found]
-    shown = each(run, left, lambda t: own_shape(run, t, alone[t], images))
-    lost = [t for t in left if shown[t] is None]
+    own = each(run, left, lambda t: own_shape(run, t, alone[t], images))
+    lost = [t for t in left if own[t] is None]
     alien = tuple(sorted(t for t in alien if t not in found))
     warnings += [say.kept_apart(alien)] if alien else []
     warnings += say.of_register(placed, found, lost)
@@ -108,7 +108,8 @@ def kept_apart(
     kept: list[int] = list(joined[:1])
     for toss in joined[1:]:
         tried = [*kept, toss]
-        if not _unexplained(run, together, fuse_frames(run, dict.fromkeys(tried, together), images), images, tried):
+        shown = fused(run, dict.fromkeys(tried, together), images)
+        if shown is None or not _unexplained(run, together, shown, images, tried):
             kept = tried
     return tuple(t for t in joined if t not in kept)
 
@@ -116,14 +117,17 @@ def kept_apart(
 def _unexplained(
     run: Run, together: Done, shape: Done, images: Mapping[int, Images], tosses: Sequence[int]
 ) -> list[int]:
-    """Tosses whose outline the shape does not explain, although their own frames alone do."""
+    """Tosses whose outline the shape does not explain, although their own frames alone do. (Where none of them is sure,
+    they explain nothing, and are no part of the shape.)"""
     limit = run.config.cycle.apart_mask
     left = _left(run, together, dict.fromkeys(tosses, shape), images)
     unexplained = [t for t in tosses if left[t] > limit]
     if not unexplained:
         return []
-    alone = _left(run, together, each(run, unexplained, lambda t: fuse_frames(run, {t: together}, images)), images)
-    return [t for t in unexplained if left[t] > alone[t] + 0.5 * limit]
+    found = each(run, unexplained, lambda t: fused(run, {t: together}, images))
+    own = {t: shape for t, shape in found.items() if shape is not None}
+    alone = _left(run, together, own, images) if own else {}
+    return [t for t in alone if left[t] > alone[t] + 0.5 * limit]
 
 
 def _left(run: Run, together: Done, shapes: Mapping[int, Done], images: Mapping[int, Images]) -> dict[int, float]:

@@ -27,10 +27,10 @@ from recordings.tracks import ObjectTrack
 
 
 def stages(
-    tiny_world: Any, run: Run, folder: Path, turned: int | None, narrower_px: int = 0
+    tiny_world: Any, run: Run, folder: Path, turned: int | None, narrower_px: int = 0, unsure: tuple[int, ...] = ()
 ) -> tuple[Done, dict[int, Images]]:
-    """True poses as the stage of all tosses, one of them turned about the object's centre, and true masks (or narrower
-    ones)."""
+    """True poses as the stage of all tosses, one of them turned about the object's centre, some not sure of any frame,
+    and true masks (or narrower ones)."""
     tracks, images = folder / "register-0", {}
     tracks.mkdir(parents=True)
     for toss in run.tosses:
@@ -41,7 +41,7 @@ def stages(
         if toss == turned:
             turn[:3, :3] = rotation_exp(np.array([0.0, np.pi / 2, 0.0]))
         n = len(times_ns)
-        status: Any = ("tracked",) * n
+        status: Any = ("interpolated" if toss in unsure else "tracked",) * n
         track = ObjectTrack(
             toss, "d455", "object", times_ns, np.stack(poses) @ turn, status, np.tile(1e-6 * np.eye(6), (n, 1, 1))
         )
@@ -70,6 +70,18 @@ def test_a_toss_that_is_turned_against_the_others_is_kept_apart(
     session = Session.open(tiny_world.record(tmp_path / "tiny", tosses=(0, 1, 2), frames=6))
     run = start_run(session, session.tosses, tmp_path / "out", Config(), "multi-hypothesis", lambda _: Silent())
     together, images = stages(tiny_world, run, tmp_path, turned)
+    fused = fuse_frames(run, dict.fromkeys(session.tosses, together), images)
+    assert kept_apart(run, together, fused, images, session.tosses) == apart
+
+
+@pytest.mark.parametrize(("unsure", "apart"), [((1,), ()), ((0,), (2,)), ((0, 2), ())])
+def test_a_toss_without_a_sure_frame_explains_nothing_alone_and_ends_no_run(
+    tiny_world: Any, tmp_path: Path, unsure: tuple[int, ...], apart: tuple[int, ...]
+) -> None:
+    session = Session.open(tiny_world.record(tmp_path / "tiny", tosses=(0, 1, 2), frames=6))
+    run = start_run(session, session.tosses, tmp_path / "out", Config(), "multi-hypothesis", lambda _: Silent())
+    turned = 1 if unsure == (1,) else 2
+    together, images = stages(tiny_world, run, tmp_path, turned, unsure=unsure)
     fused = fuse_frames(run, dict.fromkeys(session.tosses, together), images)
     assert kept_apart(run, together, fused, images, session.tosses) == apart
 
