@@ -140,8 +140,9 @@ def _shift(reference: UInt8[Array, "h w"], other: UInt8[Array, "h w"], corners: 
     shift = float(np.quantile(np.linalg.norm(after - before, axis=1), STILL_SHARE))
     near = max(MOVED_PX / 2, ALIKE * shift)
     cv2.setRNGSeed(0)
-    _, alike = cv2.estimateAffinePartial2D(before, after, ransacReprojThreshold=near)
-    return shift if shift < MOVED_PX / 2 or np.mean(alike) > 0.5 else float("nan")
+    similarity, alike = cv2.estimateAffinePartial2D(before, after, ransacReprojThreshold=near)
+    as_one = similarity is not None and float(np.mean(alike)) > 0.5
+    return shift if shift < MOVED_PX / 2 or as_one else float("nan")
 
 
 def _followed(
