@@ -18,7 +18,7 @@ from processing.stages.segment import SegmentResult
 from processing.store import Done, locked
 from processing.variants import Variant
 from recordings.notices import in_order
-from recordings.results.folder import Scope, TossRecord, VariantRecord, write_variant
+from recordings.results.folder import Scope, TossRecord, VariantRecord, read_track, write_variant
 
 
 def write_record(
@@ -30,7 +30,7 @@ def write_record(
     lost = {t: lose(run, t, masks[t]) for t in run.lost}
     tracks, shapes = {**last.tracks, **lost}, {**last.shapes, **dict.fromkeys(lost, last.shape)}
     scale_sigma, first = posterior_sigma(rig.result.scale_sigma, run.config.rig.scale), min(last.tracks)
-    together = [t for t, done in alone.items() if t in last.tracks and last.tracks[t].key != done.key]
+    together = posed_together(last.tracks, alone)
     on_shape = {t: alone[t] for t in together if not isinstance(last.tracks[t].result, RegisterResult)}
 
     def of_toss(t: int) -> TossRecord:
@@ -67,3 +67,9 @@ def write_record(
     with locked(run.store.results / ".variants.lock"):
         write_variant(run.store.results, record)
     return record
+
+
+def posed_together(tracks: Mapping[int, Done], alone: Mapping[int, Done]) -> list[int]:
+    """Tosses that have poses in another stage's object frame than their first pass: those that its shape comes from."""
+    moved = [t for t, done in alone.items() if t in tracks and tracks[t].key != done.key]
+    return [t for t in moved if not read_track(tracks[t].folder, t).lost.all()]

@@ -4,14 +4,18 @@ poses on a shape that repeats the errors of those that it was fused from."""
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from processing.pipeline.record import posed_together
 from processing.segment.background.depth_scale import DepthScaleSettings, posterior_sigma
 from processing.stages.recording.every_frame import defining_pose, scaled_by_chance
+from processing.store import Done
 from processing.track.flags import SURE_DEG, SURE_M, camera_covariance, published, with_shape_error
 from recordings.geometry import rotation_exp
+from recordings.results.folder import write_track
 from recordings.tracks import ObjectTrack
 
 FRAMES, SIGMA = 12, 0.008
@@ -138,3 +142,13 @@ def test_tracked_promises_five_degrees_and_two_centimetres(turn_deg: float, plac
     said = published(replace(track, covariance=covariance)).status
     assert said[4] == ("tracked" if sure else "interpolated")
     assert [s for i, s in enumerate(said) if i != 4] == [s for i, s in enumerate(track.status) if i != 4]
+
+
+def test_a_toss_without_a_pose_is_none_of_those_that_the_shape_comes_from(tmp_path: Path) -> None:
+    track = true_track()
+    for t in (0, 1, 2):
+        write_track(tmp_path, replace(track, toss=t) if t != 1 else ObjectTrack.nowhere(1, "d455", track.time_ns))
+    alone = {t: Done(tmp_path, f"alone {t}", None, False) for t in range(4)}
+    together = Done(tmp_path, "together", None, False)
+    assert posed_together({0: together, 1: together, 2: alone[2]}, alone) == [0]
+    assert posed_together({0: together, 1: together, 2: together}, alone) == [0, 2]
