@@ -7,8 +7,9 @@ python tools/bench_variety.py --make choose-003 --out DIR           # one sessio
 python tools/bench_variety.py --sheet docs/variety.png --n 24             # a random frame of each, to be looked at
 python tools/bench_variety.py --move judge-007 --why "looked into: lost on the steel table"
 
-A session at a time, made on the fly (path tracing needs Blender: `make blender`); what is finished stays in --out and
-`--resume` goes on. A session that cannot be shown, or on which anything crashes, is counted and named.
+A session at a time, made on the fly (path tracing needs Blender: `make blender`; VARIETY_BLENDER_DEVICE=CUDA has a
+graphics card do it); what is finished stays in --out and `--resume` goes on. A session that cannot be shown, or on which
+anything crashes, is counted and named.
 """
 
 from __future__ import annotations

@@ -19,7 +19,10 @@ from recordings.geometry import CameraModel
 from recordings.progress import Progress
 from recordings.records import RgbdFrame
 from recordings.results.folder import RobotMasks
-from recordings.tracks import ObjectShape, ObjectTrack
+from recordings.tracks import ObjectShape, ObjectTrack, Status
+
+SURE: tuple[Status, ...] = ("tracked",)
+POSED: tuple[Status, ...] = ("tracked", "interpolated")
 
 
 @dataclass(frozen=True)
@@ -53,17 +56,24 @@ def learn_shape(
     """The shape of an object in the frame that all tracks share, and how many views it was learned from. Where none of
     them looks it is `prior_shape`, if there is one.
 
-    Raises BadInput where no tracked frame shows the object.
+    Raises BadInput where no tracked frame shows the object; where none is tracked, none with a pose.
     """
-    views = chosen_views(tosses, camera, config)
+    views = chosen_views(tosses, camera, config, SURE if any_sure(tosses) else POSED)
     trained = train_field(views, config.field, device, progress, prior_shape)
     frame = tosses[0].track.object_frame
     return extract_mesh(trained.field, trained.grid, frame, "neural field"), len(views)
 
 
-def chosen_views(tosses: Sequence[TossViews], camera: CameraModel, config: LearnConfig) -> list[FieldView]:
-    """Views of tracked frames, spread evenly over all tosses. Raises BadInput where none shows the object."""
-    places = [(t, i) for t in tosses for i in range(len(t.track.status)) if t.track.status[i] == "tracked"]
+def any_sure(tosses: Sequence[TossViews]) -> bool:
+    """Whether there are tracked frames to learn from. (What guesses show is a guess, but tells more than nothing.)"""
+    return any("tracked" in t.track.status for t in tosses)
+
+
+def chosen_views(
+    tosses: Sequence[TossViews], camera: CameraModel, config: LearnConfig, statuses: tuple[Status, ...] = SURE
+) -> list[FieldView]:
+    """Views of frames of these statuses, spread evenly over all tosses. Raises BadInput where none shows the object."""
+    places = [(t, i) for t in tosses for i in range(len(t.track.status)) if t.track.status[i] in statuses]
     chosen = (
         [places[i] for i in np.unique(np.linspace(0, len(places) - 1, config.most_views).astype(int))] if places else []
     )

@@ -16,7 +16,6 @@ from processing.pipeline.cross_fit import cross_fitted, fused, located_on, sure_
 from processing.pipeline.passes import Pass
 from processing.run import Run, each
 from processing.stages.field import learn_field
-from processing.stages.fuse import fuse_frames
 from processing.stages.judge import judge, residuals
 from processing.stages.place import place_shape
 from processing.stages.register import register
@@ -35,8 +34,8 @@ def first_pass(run: Run, alone: Mapping[int, Done], images: Mapping[int, Images]
     while True:
         placed = register(run, {t: alone[t] for t in tosses}, images)
         joined = [t for t in tosses if t not in placed.result.not_joined]
-        shown = fuse_frames(run, dict.fromkeys(joined, placed), images)
-        unexplained = kept_apart(run, placed, shown, images, joined)
+        shown = fused(run, dict.fromkeys(joined, placed), images)
+        unexplained = kept_apart(run, placed, shown, images, joined) if shown is not None else ()
         if not unexplained:
             break
         alien, tosses = (*alien, *unexplained), tuple(t for t in tosses if t not in unexplained)
@@ -53,6 +52,7 @@ def first_pass(run: Run, alone: Mapping[int, Done], images: Mapping[int, Images]
     tracks = {**fitted, **dict.fromkeys(lost, placed)}
     tracks = {t: tracks[t] for t in run.tosses if t in tracks}
     shape = learn_field(run, "all tosses", fitted, images)
+    warnings += say.of_shape(shape)
     shared = len(tracks) == len(run.tosses)
     return Pass(tracks, dict.fromkeys(tracks, shape), shared_frame=shared, warnings=tuple(warnings))
 
@@ -65,7 +65,9 @@ def located(
     that surely fits better alone."""
     if not missing:
         return {}
-    shape = fuse_frames(run, joined, images)
+    shape = fused(run, joined, images)
+    if shape is None:  # they are no surer of it
+        return {}
     tracks = {t: done for t, done in each(run, missing, lambda t: located_on(run, images[t], shape)).items() if done}
     explained = {t: done for t, done in tracks.items() if not _unexplained(run, done, shape, images, [t])}
     better = each(run, explained, lambda t: sure_alone(run, images[t], missing[t], explained[t]))

@@ -9,6 +9,7 @@ from processing.config import CycleConfig
 from processing.refine.image_residuals import Difference
 from processing.run import Run
 from processing.sensor.noise import PUBLISHED
+from processing.stages.field import FieldResult
 from processing.stages.lose import SEE
 from processing.stages.recording.noise import NoiseResult
 from processing.stages.recording.rig import RigResult
@@ -132,6 +133,14 @@ def of_register(done: Done[RegisterResult], located: Collection[int] = (), lost:
         seen = f"tosses {unsure}: the object looks alike from several sides; their object frame may be turned"
         found.append(Notice("register", "high", seen, "compare their frames in `toss-view RESULTS`", "possible"))
     return found
+
+
+def of_shape(done: Done[FieldResult]) -> list[Notice]:
+    """A shape of frames none of which is sure."""
+    if done.result.sure:
+        return []
+    do = f"most often the masks hold other things, or the object is small, dark or blurred: {SEE}"
+    return [Notice("shape", "high", "no frame has a pose that is sure: the shape is a guess, as they are", do)]
 
 
 def kept_apart(tosses: Sequence[int]) -> Notice:

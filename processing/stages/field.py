@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from processing.field.learn import LearnConfig, learn_shape
+from processing.field.learn import LearnConfig, any_sure, learn_shape
 from processing.images import Images, track_and_image_keys
 from processing.run import Run
 from processing.sensor.noise import DepthNoise
@@ -18,11 +18,13 @@ VERSION = 11
 
 @dataclass(frozen=True)
 class FieldResult:
-    """Frames that were looked at, vertices of the mesh, and the share of them that no frame saw."""
+    """Frames that were looked at, vertices of the mesh, and the share of them that no frame saw; whether the poses of
+    these frames are sure."""
 
     views: int
     vertices: int
     unobserved_share: float
+    sure: bool = True
 
 
 def learn_field(
@@ -40,7 +42,7 @@ def learn_field(
         shape, used = learn_shape(views, run.camera, config, run.device, progress, body)
         write_shape(folder, shape)
         unseen = 0.0 if shape.observed is None else float((~shape.observed).mean())
-        return FieldResult(used, len(shape.vertices_m), round(unseen, 4))
+        return FieldResult(used, len(shape.vertices_m), round(unseen, 4), any_sure(views))
 
     return run.store.run("field", VERSION, plain(config), inputs, FieldResult, compute)
 

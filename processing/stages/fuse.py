@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from processing.field.fuse import fuse
-from processing.field.learn import chosen_views
+from processing.field.learn import POSED, SURE, chosen_views
 from processing.field.mesh import grid_mesh
 from processing.images import Images, track_and_image_keys
 from processing.run import Run
@@ -37,13 +37,8 @@ def fuse_frames(
     config = replace(config, voxel_m=DRAFT * config.voxel_m) if draft else config
 
     def compute(folder: Path) -> FuseResult:
-        found = {t: read_track(done.folder, t) for t, done in tracks.items()}
-        if draft:
-            found = {
-                t: replace(f, status=tuple("lost" if gone else "tracked" for gone in f.lost)) for t, f in found.items()
-            }
-        seen = [images[t].open().views(track) for t, track in found.items()]
-        views = chosen_views(seen, run.camera, run.config.shape)
+        seen = [images[t].open().views(read_track(done.folder, t)) for t, done in tracks.items()]
+        views = chosen_views(seen, run.camera, run.config.shape, POSED if draft else SURE)
         write_shape(folder, grid_mesh(fuse(views, config), seen[0].track.object_frame))
         return FuseResult(tuple(tracks), len(views))
 

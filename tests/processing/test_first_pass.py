@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,13 +16,14 @@ from processing.pipeline import first_pass
 from processing.pipeline.first_pass import _left, kept_apart
 from processing.pipeline.start import start_run
 from processing.run import Run
+from processing.stages.field import FieldResult
 from processing.stages.fuse import fuse_frames
 from processing.stages.register import RegisterResult
 from processing.stages.track import TrackResult
 from processing.store import Done
 from recordings.geometry import rotation_exp
 from recordings.progress import Silent
-from recordings.results.folder import read_masks, write_masks, write_track
+from recordings.results.folder import read_masks, read_shape, write_masks, write_track
 from recordings.session import RgbdFrames, Session
 from recordings.tracks import ObjectTrack
 
@@ -86,6 +88,25 @@ def test_a_toss_without_a_sure_frame_explains_nothing_alone_and_ends_no_run(
     assert kept_apart(run, together, fused, images, session.tosses) == apart
 
 
+def test_where_no_frame_of_any_toss_is_sure_the_shape_is_a_guess_and_said_to_be(
+    tiny_world: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    session = Session.open(tiny_world.record(tmp_path / "tiny", tosses=(0, 1), frames=4))
+    run = start_run(session, session.tosses, tmp_path / "out", Config(), "multi-hypothesis", lambda _: Silent())
+    together, images = stages(tiny_world, run, tmp_path, None, unsure=session.tosses)
+    placed = replace(together, result=RegisterResult((), (), ()))
+    monkeypatch.setattr(first_pass, "register", lambda *_: placed)
+    alone = {t: replace(together, result=TrackResult(4, 4, 0)) for t in run.tosses}
+    found = first_pass.first_pass(run, alone, images)
+    assert found.shape.result.views == 8
+    assert not found.shape.result.sure
+    extent_m = np.ptp(read_shape(found.shape.folder).vertices_m, axis=0)
+    np.testing.assert_allclose(extent_m, [0.10, 0.08, 0.06], atol=0.012)
+    assert [w.seen for w in found.warnings if w.weight == "high"] == [
+        "no frame has a pose that is sure: the shape is a guess, as they are"
+    ]
+
+
 def test_tosses_whose_masks_are_bad_alike_are_not_kept_apart(tiny_world: Any, tmp_path: Path) -> None:
     """No shape explains such masks well, that of all tosses no worse than that of each alone."""
     session = Session.open(tiny_world.record(tmp_path / "tiny", tosses=(0, 1), frames=6))
@@ -112,7 +133,7 @@ def test_the_others_are_joined_anew_without_a_toss_that_is_kept_apart(
         return Done(tmp_path, f"together {sorted(tracks)}", RegisterResult((), (), ()), False)
 
     def field(_: Run, name: str, tracks: dict[int, Done], __: Any) -> Done:
-        return Done(tmp_path, f"{name} {sorted(tracks)}", None, False)
+        return Done(tmp_path, f"{name} {sorted(tracks)}", FieldResult(2, 8, 0.0), False)
 
     def apart(_: Run, __: Done, ___: Done, ____: Any, joined: list[int]) -> tuple[int, ...]:
         return tuple(t for t in joined if t == 1)
@@ -124,7 +145,7 @@ def test_the_others_are_joined_anew_without_a_toss_that_is_kept_apart(
         assert (sorted(joined), missing) == ([0, 2], {1: alone[1]})
         return {1: Done(tmp_path, "located", None, False)} if found_again else {}
 
-    fakes = {"register": register, "learn_field": field, "kept_apart": apart, "fuse_frames": fuse, "located": located}
+    fakes = {"register": register, "learn_field": field, "kept_apart": apart, "fused": fuse, "located": located}
     for name, fake in fakes.items():
         monkeypatch.setattr(first_pass, name, fake)
     asked: list[list[int]] = []

@@ -1,6 +1,7 @@
 """A program of its own, run by a Python that has Blender's `bpy` (and none of tosslab): path-traced linear pictures.
 
     PYTHON render_blender.py JOB_FOLDER        # reads JOB_FOLDER/job.json, writes the pictures it names, in order
+    VARIETY_BLENDER_DEVICE=CUDA PYTHON …       # on a graphics card: CUDA, OPTIX, HIP, METAL or ONEAPI
 
 The job is plain data: bodies (`.npz` meshes, `.png` textures), lamps, a picture of the surroundings, one pinhole
 camera, and pictures: a crop, samples a pixel, and where each moving body is at the begin and end of the shutter.
@@ -10,6 +11,7 @@ Every picture is a float16 array (rows from the top) in linear light.
 from __future__ import annotations
 
 import json
+import os
 import sys
 from pathlib import Path
 
@@ -17,6 +19,7 @@ import bpy  # type: ignore[import-not-found]
 import numpy as np
 from mathutils import Matrix  # type: ignore[import-not-found]
 
+DEVICE = "VARIETY_BLENDER_DEVICE"
 BOUNCES, DIFFUSE_BOUNCES, GLOSSY_BOUNCES = 4, 2, 2
 SENSOR_MM = 36.0
 CV_TO_BLENDER = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -45,6 +48,8 @@ def set_up(scene, job) -> None:  # type: ignore[no-untyped-def]
     scene.render.engine = "CYCLES"
     cycles = scene.cycles
     cycles.device, cycles.use_adaptive_sampling, cycles.seed = "CPU", False, int(job["seed"]) % (1 << 31)
+    if DEVICE in os.environ:
+        on_graphics_card(cycles, os.environ[DEVICE])
     cycles.use_denoising, cycles.denoiser, cycles.denoising_prefilter = True, "OPENIMAGEDENOISE", "FAST"
     cycles.max_bounces, cycles.diffuse_bounces, cycles.glossy_bounces = BOUNCES, DIFFUSE_BOUNCES, GLOSSY_BOUNCES
     cycles.caustics_reflective = cycles.caustics_refractive = False
@@ -56,6 +61,20 @@ def set_up(scene, job) -> None:  # type: ignore[no-untyped-def]
     rolling = job["exposure_s"] / (job["exposure_s"] + job["readout_s"])
     if job["readout_s"] > 0:
         cycles.rolling_shutter_type, cycles.rolling_shutter_duration = "TOP", rolling
+
+
+def on_graphics_card(cycles, kind) -> None:  # type: ignore[no-untyped-def]
+    settings = bpy.context.preferences.addons["cycles"].preferences
+    try:
+        settings.compute_device_type = kind
+    except TypeError as wrong:
+        raise SystemExit(f"{DEVICE}={kind}: {wrong}") from wrong
+    settings.get_devices()
+    for device in settings.devices:
+        device.use = device.type == kind
+    if not any(d.use for d in settings.devices):
+        raise SystemExit(f"{DEVICE}={kind}: Blender sees no such graphics card; unset it to render on the processor")
+    cycles.device, cycles.denoising_use_gpu = "GPU", True
 
 
 def camera(scene, told) -> None:  # type: ignore[no-untyped-def]
