@@ -8,8 +8,8 @@ python tools/bench_variety.py --sheet docs/variety.png --n 24             # a ra
 python tools/bench_variety.py --move judge-007 --why "looked into: lost on the steel table"
 
 A session at a time, made on the fly (path tracing needs Blender: `make blender`; VARIETY_BLENDER_DEVICE=CUDA has a
-graphics card do it); what is finished stays in --out and `--resume` goes on. A session that cannot be shown, or on which
-anything crashes, is counted and named.
+graphics card do it); what is finished stays in --out and `--resume` goes on. A session that cannot be shown, or on
+which anything crashes, is counted and named.
 """
 
 from __future__ import annotations
