@@ -12,7 +12,7 @@ from numpy import ndarray as Array
 from processing.engine.parts import side_by_side
 from processing.field.mesh import extract_mesh
 from processing.field.train import FieldConfig, train_field
-from processing.field.views import FieldView, make_view
+from processing.field.views import FieldView, make_view, without_strays
 from processing.motion.interpolate import pose_at
 from recordings.errors import BadInput
 from recordings.geometry import CameraModel
@@ -72,7 +72,8 @@ def any_sure(tosses: Sequence[TossViews]) -> bool:
 def chosen_views(
     tosses: Sequence[TossViews], camera: CameraModel, config: LearnConfig, statuses: tuple[Status, ...] = SURE
 ) -> list[FieldView]:
-    """Views of frames of these statuses, spread evenly over all tosses. Raises BadInput where none shows the object."""
+    """Views of frames of these statuses, spread evenly over all tosses, without what is none of the object's. Raises
+    BadInput where none shows the object."""
     places = [(t, i) for t in tosses for i in range(len(t.track.status)) if t.track.status[i] in statuses]
     chosen = (
         [places[i] for i in np.unique(np.linspace(0, len(places) - 1, config.most_views).astype(int))] if places else []
@@ -84,7 +85,7 @@ def chosen_views(
             "no frame has a pose that is sure, so there is nothing to learn a shape from; wanted at least one: look at "
             "the masks with `toss-view`, give a first mask, or record closer and with more light"
         )
-    return views
+    return without_strays(views)
 
 
 def _view(toss: TossViews, position: int, camera: CameraModel) -> FieldView | None:

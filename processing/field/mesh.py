@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Bool, Float, Float32, Int
 from numpy import ndarray as Array
 from scipy import ndimage
 from skimage.measure import marching_cubes
@@ -33,14 +33,12 @@ def grid_mesh(grid: Grid, object_frame: str = "object", source: str = "fused") -
 
 
 def surface_of(sdf_m: Float32[Array, "a b c"], grid: Grid) -> tuple[Float[Array, "v 3"], Array]:
-    """Vertices in metres and outward-facing triangles of the largest solid, and of others nearly as large: a hand may
-    hide what joins them. A border of empty cells closes them."""
+    """Vertices in metres and outward-facing triangles of the solid that was seen most, and of others seen as well: a
+    hand may hide what joins them, or a thin part is lost. A border of empty cells closes them."""
     solid, count = ndimage.label(sdf_m < 0)
     if count == 0:
         raise BadInput("the field has no inside, so no surface: the views see too little of the object")
-    sizes = np.bincount(solid.ravel(), minlength=count + 1)
-    sizes[0] = 0
-    kept = (sizes >= PIECE_SHARE * sizes.max())[solid]
+    kept = _pieces(solid, count, grid)[solid]
     cleaned = np.where((sdf_m < 0) & ~kept, grid.voxel_m, sdf_m)
     cleaned = np.where(ndimage.binary_dilation(kept), cleaned, np.maximum(cleaned, 0.1 * grid.voxel_m))
     cleaned = _fill_cavities(cleaned, grid.voxel_m)
@@ -51,11 +49,26 @@ def surface_of(sdf_m: Float32[Array, "a b c"], grid: Grid) -> tuple[Float[Array,
     return grid.points(vertices.astype(np.float64) - 1), faces.astype(np.int64)
 
 
-PIECE_SHARE = 0.25
-"""Of the largest solid's volume: a smaller one beside it is no part of the object but what masks let through."""
+PIECE_SHARE = 0.05
+"""Of the main solid's volume: a smaller one beside it is a crumb."""
+PIECE_SEEN = 0.25
+"""Of the views that the main solid's surface was seen in: where fewer saw another one, it is no part of the object but
+what masks let through, or nothing that was seen at all."""
 LEAST_SHARE = 1e-3
 """Of a cell's edge: a surface nearer to a cell's corner is moved away that far, because triangles that meet in the
 corner would have no area."""
+
+
+def _pieces(solid: Int[Array, "a b c"], count: int, grid: Grid) -> Bool[Array, " pieces"]:
+    """Which of the labelled solids (0: empty) belong to the object."""
+    size = np.bincount(solid.ravel(), minlength=count + 1)
+    size[0] = 0
+    beside = ndimage.maximum_filter(solid, size=3)[grid.weight > 0]
+    weight = np.bincount(beside, weights=grid.weight[grid.weight > 0], minlength=count + 1)
+    weight[0] = 0
+    usual = weight / np.maximum(np.bincount(beside, minlength=count + 1), 1)
+    main = int(np.argmax(weight)) if weight.any() else int(np.argmax(size))
+    return np.asarray((size >= PIECE_SHARE * size[main]) & (size > 0) & (usual >= PIECE_SEEN * usual[main]))
 
 
 def _fill_cavities(sdf_m: Float32[Array, "a b c"], voxel_m: float) -> Float32[Array, "a b c"]:

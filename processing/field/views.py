@@ -7,8 +7,11 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Float32, UInt8
+from jaxtyping import Bool, Float, Float32, Int64, UInt8
 from numpy import ndarray as Array
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from recordings.errors import BadInput
 from recordings.geometry import CameraModel
@@ -116,6 +119,48 @@ def object_box(views: Sequence[FieldView], trim: float = 0.002) -> tuple[Float[A
     if len(points_m) < 100:
         raise BadInput(f"only {len(points_m)} depth points on the object in {len(views)} views; wanted at least 100")
     return np.quantile(points_m, trim, axis=0), np.quantile(points_m, 1 - trim, axis=0)
+
+
+STRAY_CELL_M = 0.008
+"""Width of the cells in which points are counted; pieces with fewer than `STRAY_GAP` of them between each other are
+one."""
+STRAY_GAP = 3
+STRAY_SHARE = 0.25
+"""Of the views that saw the largest piece, counted in each of its cells: a piece apart from it that so many did not see
+is none of the object's."""
+
+
+def without_strays(views: Sequence[FieldView]) -> list[FieldView]:
+    """The views without depth far beside what most of them show: of what is seen past the edge of a mask, or through it
+    where depth is exposed at another time than colour. It lies elsewhere on the body in each view.
+
+    Left in, it makes the grid large and the hull of what was seen larger, and may outgrow the object.
+    """
+    cells = [np.floor(object_points(view) / STRAY_CELL_M).astype(np.int64) for view in views]
+    seen = [np.unique(c, axis=0) for c in cells]
+    if not any(len(s) for s in seen):
+        return list(views)
+    each, times_seen = np.unique(np.concatenate(seen), axis=0, return_counts=True)
+    near = cKDTree(each).query_pairs(STRAY_GAP, p=np.inf, output_type="ndarray")
+    joined = coo_array((np.ones(len(near)), tuple(near.T)), shape=(len(each), len(each)))
+    count, piece = connected_components(joined, directed=False)
+    if count == 1:
+        return list(views)
+    evidence = np.bincount(piece, weights=times_seen)
+    kept = each[(evidence >= STRAY_SHARE * evidence.max())[piece]]
+    return [_only(view, own, kept) for view, own in zip(views, cells)]
+
+
+def _only(view: FieldView, cells: Int64[Array, "n 3"], kept: Int64[Array, "m 3"]) -> FieldView:
+    """The view without depth outside these cells; `cells`: that of each of its points."""
+    _, number = np.unique(np.concatenate([kept, cells]), axis=0, return_inverse=True)
+    stray = ~np.isin(number.ravel()[len(kept) :], number.ravel()[: len(kept)])
+    if not stray.any():
+        return view
+    depth_m = view.depth_m.copy()
+    v, u = np.nonzero(depth_m)
+    depth_m[v[stray], u[stray]] = 0
+    return replace(view, depth_m=depth_m)
 
 
 def object_points(view: FieldView) -> Float[Array, "n 3"]:

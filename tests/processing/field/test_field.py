@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from processing.field.fuse import FuseConfig, fuse
 from processing.field.mesh import extract_mesh, grid_mesh, surface_of
 from processing.field.train import FieldConfig, train_field
-from processing.field.views import FieldView, make_view, object_points
+from processing.field.views import FieldView, make_view, object_points, without_strays
 from processing.motion.interpolate import pose_at
 from recordings.errors import BadInput
 from recordings.geometry import CameraModel
@@ -258,13 +258,43 @@ def test_a_lost_frame_has_no_pose_at_depths_exposure_either() -> None:
             np.testing.assert_array_equal(pose_at(track, i, int(times_ns[i]) + late_ns), poses[i])
 
 
-def test_pieces_that_a_hand_cuts_apart_are_all_kept_and_crumbs_are_not() -> None:
+def test_pieces_that_were_seen_are_all_kept_but_crumbs_and_what_few_views_saw_are_not() -> None:
+    """A hand cuts one piece off, and a thin part is lost between them; what masks let through may be larger."""
     grid = fuse(cube_views(8), FuseConfig(truncation_m=0.005))
-    sdf = np.full_like(grid.sdf_m, grid.voxel_m)
-    for start, edge in ((2, 8), (14, 6), (24, 3)):
+    sdf, weight = np.full_like(grid.sdf_m, grid.voxel_m), np.zeros_like(grid.weight)
+    for start, edge, seen in ((2, 8, 9.0), (14, 6, 4.0), (22, 2, 9.0), (26, 10, 0.5)):
         sdf[start : start + edge, 2 : 2 + edge, 2 : 2 + edge] = -grid.voxel_m
-    vertices_m, faces = surface_of(sdf, replace(grid, sdf_m=sdf))
+        weight[start - 1 : start + edge + 1, 1 : 3 + edge, 1 : 3 + edge] = seen
+    vertices_m, faces = surface_of(sdf, replace(grid, sdf_m=sdf, weight=weight))
     bodies = trimesh.Trimesh(vertices_m, faces).split()
     sizes = sorted(float(np.ptp(b.vertices, axis=0).mean()) / grid.voxel_m for b in bodies)
     assert sizes == pytest.approx([6, 8], abs=0.01)
     assert all(b.is_watertight for b in bodies)
+
+
+def test_depth_past_the_edge_of_masks_does_not_make_the_grid_larger(views: list[FieldView]) -> None:
+    """In two views a part of the mask shows what is far behind the body, as where depth is exposed late."""
+    behind = []
+    for number, view in enumerate(views):
+        depth_m = view.depth_m.copy()
+        if number in (3, 11):
+            rows = np.flatnonzero((depth_m > 0).any(axis=1))[:20]
+            depth_m[rows] = np.where(depth_m[rows] > 0, np.float32(1.4), 0)
+        behind.append(replace(view, depth_m=depth_m))
+    cleaned = without_strays(behind)
+    for was, dirty, clean in zip(views, behind, cleaned):
+        np.testing.assert_array_equal(clean.depth_m, np.where(dirty.depth_m == was.depth_m, was.depth_m, 0))
+    config = FuseConfig(truncation_m=0.005)
+    grids = [fuse(v, config) for v in (views, behind, cleaned)]
+    sizes_m = [max(g.sdf_m.shape) * g.voxel_m for g in grids]
+    assert sizes_m[1] > 0.5
+    assert sizes_m[2] == pytest.approx(sizes_m[0], abs=0.003)
+    error_m = np.abs(distance_to_cube_m(grid_mesh(grids[2]).vertices_m))
+    assert np.quantile(error_m, 0.95) < 0.001
+
+
+def test_views_without_strays_or_without_points_stay_as_they_are(views: list[FieldView]) -> None:
+    assert all(a is b for a, b in zip(without_strays(views), views, strict=True))
+    blind = [replace(v, depth_m=np.zeros_like(v.depth_m)) for v in views[:2]]
+    assert all(a is b for a, b in zip(without_strays(blind), blind, strict=True))
+    assert without_strays([]) == []
