@@ -30,14 +30,11 @@ def write_record(
     lost = {t: lose(run, t, masks[t]) for t in run.lost}
     tracks, shapes = {**last.tracks, **lost}, {**last.shapes, **dict.fromkeys(lost, last.shape)}
     scale_sigma, first = posterior_sigma(rig.result.scale_sigma, run.config.rig.scale), min(last.tracks)
-    together = posed_together(last.tracks, alone)
-    on_shape = {t: alone[t] for t in together if not isinstance(last.tracks[t].result, RegisterResult)}
+    moved = posed_together(last.tracks, alone)
+    on_shape = {t: alone[t] for t in moved if not isinstance(last.tracks[t].result, RegisterResult)}
 
     def of_toss(t: int) -> TossRecord:
-        poses = poses_in_every_frame(
-            run, t, tracks[t], (first, tracks[first]), scale_sigma, on_shape.get(t),
-            len(together) if scope == "all" else 1,
-        )  # fmt: skip
+        poses = poses_in_every_frame(run, t, tracks[t], (first, tracks[first]), scale_sigma, on_shape.get(t))
         return TossRecord(t, poses.name, shapes[t].name, masks_in_every_frame(run, t, masks[t]).name)
 
     tosses = tuple(of_toss(t) for t in run.recorded)

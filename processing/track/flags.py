@@ -199,12 +199,12 @@ SURE_DEG, SURE_M = 5.0, 0.02
 first is the field's limit of a right pose (5 degrees, 5 cm). Inside, surer than `FlagConfig.unsure_deg` will do."""
 
 
-def with_shape_error(track: ObjectTrack, alone: ObjectTrack, tosses: int) -> ObjectTrack:
+def with_shape_error(track: ObjectTrack, alone: ObjectTrack) -> ObjectTrack:
     """The track of a toss on a shape, its covariances with the error of that shape.
 
     The shape was fused from the tosses' first passes (`alone`: this toss's) and repeats their errors, so that no
-    alignment to it takes them away. Those of so many `tosses` are independent: of their mean, the variance is one in
-    `tosses` of each. Frames that were lost alone are as unsure as its others in the mean.
+    alignment to it takes them away. Nor does the mean of several tosses: where each view's depth is taken for the
+    surface, all err alike. Frames that were lost alone are as unsure as its others in the mean.
     """
     posed = ~track.lost
     known = posed & ~alone.lost & np.isfinite(alone.covariance).all(axis=(1, 2))
@@ -217,7 +217,7 @@ def with_shape_error(track: ObjectTrack, alone: ObjectTrack, tosses: int) -> Obj
     errors[known] = to @ alone.covariance[known] @ to.transpose(0, 2, 1)
     errors[~known] = errors[known].mean(axis=0)
     covariance = track.covariance.copy()
-    covariance[posed] += errors[posed] / tosses
+    covariance[posed] += errors[posed]
     return replace(track, covariance=covariance)
 
 

@@ -97,9 +97,9 @@ def test_the_scales_deviation_is_the_posteriors() -> None:
 
 
 def test_on_a_shape_a_track_is_as_unsure_as_the_first_passes_that_made_it() -> None:
-    """Drawn first passes of four tosses; the shape lies where they do in the mean, and a pose on it where the shape
-    does, in another object frame."""
-    rng, tosses, drawn = np.random.default_rng(2), 4, 4000
+    """Drawn first passes; the shape lies where they do, and a pose on it where the shape does, in another object
+    frame."""
+    rng, drawn = np.random.default_rng(2), 4000
     true = true_track()
     twist = np.diag([2e-3, 1e-3, 3e-3, 0.03, 0.05, 0.02]) ** 2  # of the object frame: translation, rotation
     pose, frame_from_own = true.camera_from_object[3], np.eye(4)
@@ -111,11 +111,11 @@ def test_on_a_shape_a_track_is_as_unsure_as_the_first_passes_that_made_it() -> N
     )
     on_shape = replace(alone, camera_from_object=np.tile(pose @ frame_from_own, (FRAMES, 1, 1)), covariance=0 * cov)
     errors = np.empty((drawn, 6))
-    for k, four in enumerate(rng.multivariate_normal(np.zeros(6), cov[0], size=(drawn, tosses))):
-        turn, shift = four[:, :3].mean(axis=0), four[:, 3:].mean(axis=0)
+    for k, error in enumerate(rng.multivariate_normal(np.zeros(6), cov[0], size=drawn)):
+        turn, shift = error[:3], error[3:]
         lever = (pose @ frame_from_own)[:3, 3] - pose[:3, 3]
         errors[k] = np.r_[turn, shift + rotation_exp(turn) @ lever - lever]
-    claimed = with_shape_error(on_shape, alone, tosses).covariance[3]
+    claimed = with_shape_error(on_shape, alone).covariance[3]
     scale = np.sqrt(np.outer(claimed.diagonal(), claimed.diagonal()))
     np.testing.assert_allclose(claimed / scale, np.cov(errors.T) / scale, atol=0.08)
 
@@ -125,12 +125,12 @@ def test_what_was_lost_alone_is_as_unsure_as_the_rest_in_the_mean_and_lost_poses
     poses = alone.camera_from_object.copy()
     poses[7] = poses[6]
     on_shape = replace(alone, camera_from_object=poses, status=("tracked",) * FRAMES)
-    grown = with_shape_error(on_shape, alone, 1).covariance - on_shape.covariance
+    grown = with_shape_error(on_shape, alone).covariance - on_shape.covariance
     np.testing.assert_allclose(grown[7], grown[np.arange(FRAMES) != 7].mean(axis=0), atol=1e-15)
-    still_lost = with_shape_error(alone, alone, 2)
+    still_lost = with_shape_error(alone, alone)
     np.testing.assert_array_equal(still_lost.covariance[7], alone.covariance[7])
     nowhere = ObjectTrack.nowhere(0, "d455", alone.time_ns)
-    assert with_shape_error(alone, nowhere, 2) is alone
+    assert with_shape_error(alone, nowhere) is alone
 
 
 @pytest.mark.parametrize(("turn_deg", "place_m", "sure"), [(0.9, 0.9, True), (1.1, 0.1, False), (0.1, 1.1, False)])

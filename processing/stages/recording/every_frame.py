@@ -21,7 +21,7 @@ from recordings.results.folder import RobotMasks, read_masks, read_track, write_
 from recordings.results.track_notes import FIT, NOTES
 from recordings.tracks import ObjectTrack
 
-VERSION = 5
+VERSION = 6
 
 
 @dataclass(frozen=True)
@@ -33,11 +33,11 @@ class EveryFrameResult:
 
 
 def poses_in_every_frame(
-    run: Run, toss: int, done: Done, first: tuple[int, Done], scale_sigma: float, alone: Done | None, tosses: int
+    run: Run, toss: int, done: Done, first: tuple[int, Done], scale_sigma: float, alone: Done | None
 ) -> Done:
     """A stage's track of one toss in every frame that was recorded. `first`: the toss that comes first, and its track;
     `scale_sigma`: standard deviation of depth's scale; `alone`: the toss's first pass, where the track rests on a shape
-    that was fused from the first passes of so many `tosses`. What the tracker noted of its frames goes with it where
+    that was fused from first passes. What the tracker noted of its frames goes with it where
     these are all frames."""
     kept = run.kept.get(toss)
     inputs = {f"track_{toss:02d}": done.key} if kept is None else {"thinned": done.key, "kept": kept.digest}
@@ -46,7 +46,7 @@ def poses_in_every_frame(
     def compute(folder: Path) -> EveryFrameResult:
         track = read_track(done.folder, toss)
         if alone is not None:
-            track = with_shape_error(track, read_track(alone.folder, toss), tosses)
+            track = with_shape_error(track, read_track(alone.folder, toss))
         defined = defining_pose(track, read_track(first[1].folder, first[0]))
         count = len(track.status)
         if kept is None:
@@ -61,7 +61,7 @@ def poses_in_every_frame(
         write_track(folder, published(scaled_by_chance(track, defined, scale_sigma)))
         return EveryFrameResult(len(track.status), count)
 
-    config = {"toss": toss, "first": first[0], "scale_sigma": scale_sigma, "tosses": tosses}
+    config = {"toss": toss, "first": first[0], "scale_sigma": scale_sigma}
     return _stage(run, config, inputs, compute)
 
 
