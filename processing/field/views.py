@@ -136,25 +136,37 @@ def without_strays(views: Sequence[FieldView]) -> list[FieldView]:
 
     Left in, it makes the grid large and the hull of what was seen larger, and may outgrow the object.
     """
-    cells = [np.floor(object_points(view) / STRAY_CELL_M).astype(np.int64) for view in views]
-    seen = [np.unique(c, axis=0) for c in cells]
-    if not any(len(s) for s in seen):
-        return list(views)
-    each, times_seen = np.unique(np.concatenate(seen), axis=0, return_counts=True)
-    near = cKDTree(each).query_pairs(STRAY_GAP, p=np.inf, output_type="ndarray")
-    joined = coo_array((np.ones(len(near)), tuple(near.T)), shape=(len(each), len(each)))
-    count, piece = connected_components(joined, directed=False)
-    if count == 1:
+    cells = [_cells(object_points(view)) for view in views]
+    each, times_seen = np.unique(np.concatenate([np.unique(c) for c in cells] or [np.zeros(0)]), return_counts=True)
+    count, piece = _pieces(each.astype(np.int64))
+    if count <= 1:
         return list(views)
     evidence = np.bincount(piece, weights=times_seen)
     kept = each[(evidence >= STRAY_SHARE * evidence.max())[piece]]
-    return [_only(view, own, kept) for view, own in zip(views, cells)]
+    return [_without(view, ~np.isin(own, kept)) for view, own in zip(views, cells)]
 
 
-def _only(view: FieldView, cells: Int64[Array, "n 3"], kept: Int64[Array, "m 3"]) -> FieldView:
-    """The view without depth outside these cells; `cells`: that of each of its points."""
-    _, number = np.unique(np.concatenate([kept, cells]), axis=0, return_inverse=True)
-    stray = ~np.isin(number.ravel()[len(kept) :], number.ravel()[: len(kept)])
+CELL_BITS = 21
+"""A cell's place along each axis, in one number: unique numbers are found ten times as fast as unique rows."""
+
+
+def _cells(points_m: Float[Array, "n 3"]) -> Int64[Array, " n"]:
+    at = np.floor(points_m / STRAY_CELL_M).astype(np.int64) + (1 << (CELL_BITS - 1))
+    return np.asarray((at[:, 0] << 2 * CELL_BITS) | (at[:, 1] << CELL_BITS) | at[:, 2])
+
+
+def _pieces(cells: Int64[Array, " m"]) -> tuple[int, Int64[Array, " m"]]:
+    """How many pieces cells make, and which one each belongs to."""
+    last = (1 << CELL_BITS) - 1
+    at = np.stack([cells >> 2 * CELL_BITS, (cells >> CELL_BITS) & last, cells & last], axis=1)
+    near = cKDTree(at).query_pairs(STRAY_GAP, p=np.inf, output_type="ndarray")
+    joined = coo_array((np.ones(len(near)), tuple(near.T)), shape=(len(cells), len(cells)))
+    count, piece = connected_components(joined, directed=False)
+    return int(count), piece.astype(np.int64)
+
+
+def _without(view: FieldView, stray: Bool[Array, " n"]) -> FieldView:
+    """The view without these of its depth points."""
     if not stray.any():
         return view
     depth_m = view.depth_m.copy()

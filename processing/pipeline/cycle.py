@@ -113,8 +113,7 @@ def second_pass(
 
     shapes = each(run, (None, *refined.halves), shown)
     halves = tuple(replace(half, shape=shapes[half]) for half in refined.halves)
-    return replace(refined, tracks=tracks, shapes=dict.fromkeys(tracks, shapes[None]), halves=halves,
-                   warnings=(*refined.warnings, *say.of_shape(shapes[None])))  # fmt: skip
+    return replace(refined, tracks=tracks, shapes=dict.fromkeys(tracks, shapes[None]), halves=halves)
 
 
 def tracked_again(

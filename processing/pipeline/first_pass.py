@@ -52,7 +52,6 @@ def first_pass(run: Run, alone: Mapping[int, Done], images: Mapping[int, Images]
     tracks = {**fitted, **dict.fromkeys(lost, placed)}
     tracks = {t: tracks[t] for t in run.tosses if t in tracks}
     shape = learn_field(run, "all tosses", fitted, images)
-    warnings += say.of_shape(shape)
     shared = len(tracks) == len(run.tosses)
     return Pass(tracks, dict.fromkeys(tracks, shape), shared_frame=shared, warnings=tuple(warnings))
 

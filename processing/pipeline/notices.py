@@ -135,12 +135,14 @@ def of_register(done: Done[RegisterResult], located: Collection[int] = (), lost:
     return found
 
 
-def of_shape(done: Done[FieldResult]) -> list[Notice]:
-    """A shape of frames none of which is sure."""
-    if done.result.sure:
+def of_shapes(shapes: Mapping[int, Done]) -> list[Notice]:
+    """Tosses whose shape was learned from frames none of which is sure."""
+    guessed = [t for t, done in shapes.items() if isinstance(done.result, FieldResult) and not done.result.sure]
+    if not guessed:
         return []
+    seen = f"tosses {guessed}: no frame has a pose that is sure: the shape is a guess, as they are"
     do = f"most often the masks hold other things, or the object is small, dark or blurred: {SEE}"
-    return [Notice("shape", "high", "no frame has a pose that is sure: the shape is a guess, as they are", do)]
+    return [Notice("shape", "high", seen, do)]
 
 
 def kept_apart(tosses: Sequence[int]) -> Notice:

@@ -40,6 +40,7 @@ def write_record(
     tosses = tuple(of_toss(t) for t in run.recorded)
     contact = {str(t): done.name for t, done in last.contact.items()}
     of_stages = [*say.of_run(run, rig, masks), *(n for done in last.contact.values() for n in say.of_contact(done))]
+    of_stages += say.of_shapes(last.shapes)
     record = VariantRecord(
         name=variant.name,
         scope=scope,
@@ -67,6 +68,6 @@ def write_record(
 
 
 def posed_together(tracks: Mapping[int, Done], alone: Mapping[int, Done]) -> list[int]:
-    """Tosses that have poses in another stage's object frame than their first pass: those that its shape comes from."""
+    """Tosses whose poses are another stage's than their first pass, but for those without any."""
     moved = [t for t, done in alone.items() if t in tracks and tracks[t].key != done.key]
     return [t for t in moved if not read_track(tracks[t].folder, t).lost.all()]

@@ -14,6 +14,7 @@ from processing.config import Config
 from processing.images import Images, TossImages
 from processing.pipeline import first_pass
 from processing.pipeline.first_pass import _left, kept_apart
+from processing.pipeline.notices import of_shapes
 from processing.pipeline.start import start_run
 from processing.run import Run
 from processing.stages.field import FieldResult
@@ -102,9 +103,9 @@ def test_where_no_frame_of_any_toss_is_sure_the_shape_is_a_guess_and_said_to_be(
     assert not found.shape.result.sure
     extent_m = np.ptp(read_shape(found.shape.folder).vertices_m, axis=0)
     np.testing.assert_allclose(extent_m, [0.10, 0.08, 0.06], atol=0.012)
-    assert [w.seen for w in found.warnings if w.weight == "high"] == [
-        "no frame has a pose that is sure: the shape is a guess, as they are"
-    ]
+    (notice,) = of_shapes(found.shapes)
+    assert notice.weight == "high"
+    assert notice.seen == "tosses [0, 1]: no frame has a pose that is sure: the shape is a guess, as they are"
 
 
 def test_tosses_whose_masks_are_bad_alike_are_not_kept_apart(tiny_world: Any, tmp_path: Path) -> None:
