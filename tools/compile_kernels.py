@@ -20,6 +20,7 @@ from multiprocessing.connection import Connection, wait
 from typing import Any
 
 TRACK, FLIGHT = "processing.track.kernels", "processing.track.flight_kernels"
+DEPTH_ERROR = "processing.track.depth_error.kernels"
 CONSISTENCY, APPEARANCE = "processing.track.registration.consistency_kernels", "processing.track.appearance_ratio"
 STEPS, SOLVER = "processing.contact.physics.steps_cpu", "processing.contact.physics.solver_cpu"
 SE3 = "processing.motion.se3_kernels"
@@ -39,6 +40,7 @@ KERNELS: dict[tuple[str, str], list[tuple[str, ...]]] = {
     (TRACK, "graph_terms"): [(T, MI, M4, M4, MI, V, V, V, F8, "boolean", T, M, T, T, M)],
     (TRACK, "view_terms"): [(M, I8, VI, T, M4, M4, MI, V, V, V, M, V)],
     (TRACK, "to_object"): [(M, V, M, F8, M, V)],
+    (DEPTH_ERROR, "add_pairs"): [(T, MI, V, VI, VI, I8, M, M, F8, M4, M4, MI, V, V, V, M, V)],
     (FLIGHT, "fit_flights"): [(M, MI, V, V, M4, M4, MI, V, V, M, F8)],
     (PROFILE, "surface_terms"): [(M4, M, M, V, V, VB, VI, V, F8, F8, M, V, M, M, V)],
     (PROFILE, "outline_terms"): [(V4, VI, V, V, M, M, V, V, VB, VI, V, F8, M, V, M, M, V)],

@@ -21,6 +21,7 @@ from processing.motion.motion_prior import free_change_rad_s, free_jerk_rad_s
 from processing.sensor import noise
 from processing.sensor.view_store import ViewStore
 from processing.track import kernels as k
+from processing.track.depth_error.fields import DepthErrors
 from processing.track.keyframes import view_directions
 from processing.track.pairs import compared
 from processing.track.schedule import Schedule, rows
@@ -72,6 +73,8 @@ class GraphConfig:
     round_body: bool = False
     """Surfaces that turn away from the camera and brightness count little: on a round body they stay with the view."""
     shared_noise: float = noise.PAIRS_PER_MEASUREMENT
+    depth_errors: noise.DepthNoise | None = None
+    """How the depth of each view errs, which is then solved for with the poses; None: depth is taken as it is."""
 
 
 def steady_motion() -> GraphConfig:
@@ -179,16 +182,19 @@ def refine(
     distance = float(np.median(np.linalg.norm(store.center_m[use], axis=1)))
     figures = np.zeros((len(pairs), 3))
     H = np.eye(6 * (int(place.max(initial=-1)) + 1))
+    errs = config.depth_errors
+    errors = None if errs is None else DepthErrors(store, use, errs, config.shared_noise)
     for row in rows(config.schedule, distance, config.round_body):
         for _ in range(int(row[k.STEPS])):
-            H, g, figures = _normal_equations(store, poses, use, pairs, place, row, motion, config, priors)
+            H, g, figures = _normal_equations(store, poses, use, pairs, place, row, motion, config, priors, errors)
             if held is not None:
                 _hold(H, held)
             step = -np.linalg.solve(H + np.diag(1e-6 * np.diag(H) + 1e-9), g).reshape(-1, 6)
+            taken = step / np.maximum(np.linalg.norm(step.reshape(-1, 2, 3), axis=2) / (0.03, 0.2), 1.0).max(1)[:, None]
             for i in np.flatnonzero(place >= 0):
-                twist = step[place[i]]
-                size = max(np.linalg.norm(twist[:3]) / 0.03, np.linalg.norm(twist[3:]) / 0.2, 1.0)
-                poses[i] = poses[i] @ se3.inverse(se3.exponential(twist / size))
+                poses[i] = poses[i] @ se3.inverse(se3.exponential(taken[place[i]]))
+            if errors is not None:
+                errors.follow(taken)
             if np.abs(step[:, :3]).max(initial=0) < 3e-5 and np.abs(step[:, 3:]).max(initial=0) < 3e-4:
                 break
     return Refined(poses, _covariances(H, place), pairs, figures)
@@ -213,15 +219,16 @@ def _hold(H: Float[Array, "f f"], held: Float[Array, "6"]) -> None:
 def _normal_equations(
     store: ViewStore, poses: Float[Array, "n 4 4"], use: Bool[Array, " n"], pairs: Int[Array, "m 2"],
     place: Int[Array, " n"], row: Float[Array, "7"], motion: Motion, config: GraphConfig,
-    priors: Sequence[Terms],
+    priors: Sequence[Terms], errors: DepthErrors | None,
 ) -> tuple[Float[Array, "f f"], Float[Array, " f"], Float[Array, "m 3"]]:  # fmt: skip
     count = int(place.max()) + 1
     blocks, gradients, figures = compared(store, poses, pairs, row, shaded=not config.round_body)
     weight = 1.0 / (1.0 + (figures[:, 0] / config.sure_cost) ** 2) / config.shared_noise
-    blocks *= weight[:, None, None]
-    gradients *= weight[:, None]
     H, g = np.zeros((count, count, 6, 6)), np.zeros((count, 6))
-    add_pairs(H, g, blocks, gradients, place[pairs])
+    if errors is None:
+        add_pairs(H, g, blocks * weight[:, None, None], gradients * weight[:, None], place[pairs])
+    else:
+        errors.add(H, g, poses, pairs, weight, place, row)
     _add_motion(H, g, poses, use, place, motion, config)
     for terms in priors:
         terms.add(H, g, poses, place)

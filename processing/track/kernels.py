@@ -56,6 +56,52 @@ ODD_COST = 0.4
 
 
 @no_type_check
+@njit(cache=True, error_model="numpy", nogil=True, fastmath=True, inline="always")
+def depth_at(maps, row, fx, fy, cx, cy, u, v, x, y, iz):
+    """Depth that a view sees at (u, v) of its crop, where the point (x, y, 1 / iz) projects: between four pixels of one
+    surface, else on the plane of the nearest pixel, whose depth is known."""
+    off, u0, v0, w = row[OFFSET], row[U0], row[V0], row[WIDTH]
+    ju, jv = int(np.floor(u)), int(np.floor(v))
+    a, b = u - ju, v - jv
+    q = off + jv * w + ju
+    z00, z10, z01, z11 = maps[q, Z], maps[q + 1, Z], maps[q + w, Z], maps[q + w + 1, Z]
+    low = min(min(z00, z10), min(z01, z11))
+    high = max(max(z00, z10), max(z01, z11))
+    if low > 0.0 and high - low < 0.012:
+        return (z00 * (1 - a) + z10 * a) * (1 - b) + (z01 * (1 - a) + z11 * a) * b
+    iu, iv = int(np.floor(u + 0.5)), int(np.floor(v + 0.5))
+    near = off + iv * w + iu
+    zr = maps[near, Z] * 1.0
+    nx, ny, nz = maps[near, NX], maps[near, NY], maps[near, NZ]
+    px, py = (iu + u0 - cx) / fx, (iv + v0 - cy) / fy
+    top = nx * px + ny * py + nz
+    bottom = nx * x * iz + ny * y * iz + nz
+    if abs(bottom) > 0.05:
+        zr = zr * top / bottom
+    return zr
+
+
+@no_type_check
+@njit(cache=True, error_model="numpy", nogil=True, fastmath=True, inline="always")
+def appearance_step(maps, q, w, a, b, channel, shown, s_int):
+    """What one channel of appearance says between the four pixels from q on: residual against what the point `shown`,
+    weight (0: another surface's, or shading alone), and its change per pixel along u and v."""
+    ch = SHARP + channel
+    i00, i10, i01, i11 = maps[q, ch], maps[q + 1, ch], maps[q + w, ch], maps[q + w + 1, ch]
+    top, bottom = i00 * (1 - a) + i10 * a, i01 * (1 - a) + i11 * a
+    e = top * (1 - b) + bottom * b - shown
+    r = e / s_int
+    if abs(r) >= 3.0:
+        return e, 0.0, 0.0, 0.0
+    gu = (i10 - i00) * (1 - b) + (i11 - i01) * b
+    gv = bottom - top
+    slope = gu * gu + gv * gv
+    least = LEAST_BRIGHT_SLOPE if channel % APPEARANCE == 0 else LEAST_SLOPE
+    k = (1.0 - r * r / 9.0) * slope / (slope + least * least)
+    return e, k * k, gu, gv
+
+
+@no_type_check
 @njit(cache=True, error_model="numpy", nogil=True, fastmath=True)
 def pair_terms(  # noqa: C901
     samples, step, pose, maps, row, focal, center, level, s_geo, s_int, s_out, round_body, shaded, H, g, Hd, gd, B, N
@@ -126,20 +172,7 @@ def pair_terms(  # noqa: C901
             cost += 0.5 * COVERED_COST
             fits = True
         else:
-            ju, jv = int(np.floor(u)), int(np.floor(v))
-            a, b = u - ju, v - jv
-            q = off + jv * w + ju
-            z00, z10, z01, z11 = maps[q, Z], maps[q + 1, Z], maps[q + w, Z], maps[q + w + 1, Z]
-            low = min(min(z00, z10), min(z01, z11))
-            high = max(max(z00, z10), max(z01, z11))
-            if low > 0.0 and high - low < 0.012:
-                zr = (z00 * (1 - a) + z10 * a) * (1 - b) + (z01 * (1 - a) + z11 * a) * b
-            else:  # follow the nearest pixel's plane to the sub-pixel place
-                px, py = (iu + u0 - cx) / fx, (iv + v0 - cy) / fy
-                top = nx * px + ny * py + nz
-                bottom = nx * x * iz + ny * y * iz + nz
-                if abs(bottom) > 0.05:
-                    zr = zr * top / bottom
+            zr = depth_at(maps, row, fx, fy, cx, cy, u, v, x, y, iz)
             ahead = zr - z  # positive: the point lies in front of what this view sees
             facing = nx * mx + ny * my + nz * mz
             r_m = (nx * x + ny * y + nz * z) * (1.0 - zr * iz)
@@ -172,19 +205,12 @@ def pair_terms(  # noqa: C901
                 continue
             suu = suv = svv = tu = tv = 0.0
             for c in range(APPEARANCE):
-                ch = SHARP + level * APPEARANCE + c
-                i00, i10, i01, i11 = maps[q, ch], maps[q + 1, ch], maps[q + w, ch], maps[q + w + 1, ch]
-                top, bottom = i00 * (1 - a) + i10 * a, i01 * (1 - a) + i11 * a
-                e = top * (1 - b) + bottom * b - p[SSHARP + level * APPEARANCE + c]
+                ch = level * APPEARANCE + c
+                e, k, gu, gv = appearance_step(maps, q, w, a, b, ch, p[SSHARP + ch], s_int)
                 r = e / s_int
                 cost += 0.5 / APPEARANCE * min(r * r / 9.0, 1.0)
-                if abs(r) < 3.0:
-                    gu = (i10 - i00) * (1 - b) + (i11 - i01) * b
-                    gv = bottom - top
-                    slope = gu * gu + gv * gv
-                    least = LEAST_BRIGHT_SLOPE if c == 0 else LEAST_SLOPE
-                    k = (1.0 - r * r / 9.0) * slope / (slope + least * least)
-                    k *= wi * trust * k
+                if k > 0.0:
+                    k *= wi * trust
                     gu *= fx * iz
                     gv *= fy * iz
                     suu, suv, svv = suu + k * gu * gu, suv + k * gu * gv, svv + k * gv * gv

@@ -38,7 +38,9 @@ def at_noise(config: TrackConfig, noise: DepthNoise) -> TrackConfig:
         view=replace(config.view, turn_share=noise.turn_share),
         flags=flags,
         beam=replace(beam, uncertain_cost=beam.uncertain_cost + more, search=beam.search + more, lost=beam.lost + more),
-        hypotheses=replace(config.hypotheses, graph=replace(graph, sure_cost=graph.sure_cost + more)),
+        hypotheses=replace(
+            config.hypotheses, depth_noise=noise, graph=replace(graph, sure_cost=graph.sure_cost + more)
+        ),
     )
 
 

@@ -28,8 +28,9 @@ def test_the_cost_of_true_poses_is_the_kernels_mean_over_noise(noise: DepthNoise
 
 def test_without_noise_nothing_costs_and_depth_finer_than_the_thresholds_leaves_them() -> None:
     assert pair_cost(DepthNoise(0.0, 49.0), 0.0035, 3) == 0.0
+    usual = TrackConfig()
     for noise in (FINE, DepthNoise(0.001, 20.0)):
-        assert at_noise(TrackConfig(), noise) == TrackConfig()
+        assert at_noise(usual, noise) == replace(usual, hypotheses=replace(usual.hypotheses, depth_noise=noise))
 
 
 def test_poses_are_as_much_less_sure_as_means_over_depth_are() -> None:

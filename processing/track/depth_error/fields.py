@@ -1,0 +1,102 @@
+"""Depth that errs, as unknowns of the joint refinement: a smooth field of relative errors over each view.
+
+Where neighbouring pixels of a depth image err together, a view's surface is not the object's: it is rounded at edges,
+tilted, bent. Pairs of views that take it for the surface trade these errors for turns, a few tenths of a degree a
+frame, and never lose them again (errors in variables; Fuller, "Measurement Error Models", 1987). Here each view's depth
+has errors of its own: values at the nodes of a grid, as fine as neighbouring pixels err alike, and as large as the
+session's noise is (`sensor/noise.py`). Appearance, outlines and the other views' depth tell them; the poses that come
+out, and what is known of them, are those whatever the errors are (Schur complement).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from numpy import ndarray as Array
+from scipy.linalg import cho_factor, cho_solve
+
+from processing.sensor import view_layout as lay
+from processing.sensor.noise import DepthNoise
+from processing.sensor.view_store import ViewStore
+from processing.track.depth_error import kernels
+from processing.track.pairs import SHADING_SIGMA
+
+LEAST_SIDE, MOST_SIDE = 3, 6
+"""Nodes along a side of a grid: with more than six the poses of eight tosses of `choose` stay where they are."""
+MOST_NODES = 2400
+"""Of all views together: more would take longer to solve for than all else."""
+LEAST_PX = 4.0
+MOST_STEP, MOST_ERROR = 0.01, 0.06
+"""Errors change by no more than this in a step, and grow no larger (relative)."""
+
+
+class DepthErrors:
+    """The errors of some views' depth, beside their poses. Weights of pairs, and those of the errors' own standard
+    deviation, are divided by `shared`, as everything that images say is."""
+
+    def __init__(self, store: ViewStore, views: Bool[Array, " v"], noise: DepthNoise, shared: float) -> None:
+        self._store, self._shared = store, shared
+        index = np.flatnonzero(views)
+        self._grid = np.full(len(views), -1)
+        self._grid[index] = np.arange(len(index))
+        spans, depth_m = _spans(store, index)
+        size = float(np.median(spans[:, 2:])) if len(index) else LEAST_PX
+        wanted = int(np.ceil(size / np.sqrt(noise.patch_px))) + 1
+        most = min(MOST_SIDE, int(np.sqrt(MOST_NODES / max(len(index), 1))))
+        self._side = int(np.clip(wanted, LEAST_SIDE, max(most, LEAST_SIDE)))
+        spans[:, 2:] = np.maximum(spans[:, 2:], LEAST_PX) / (self._side - 1)
+        self._boxes = spans
+        sigma = noise.sigma_at_1m * depth_m  # that of depth grows with the square of the distance
+        nodes = self._side**2
+        self._prior = np.repeat(sigma**-2.0, nodes)
+        self.relative = np.zeros((len(index), nodes))
+        """Of depth, at each node."""
+
+    def add(
+        self,
+        H: Float[Array, "f f 6 6"],
+        g: Float[Array, "f 6"],
+        poses: Float[Array, "n 4 4"],
+        pairs: Int[Array, "m 2"],
+        weights: Float[Array, " m"],
+        place: Int[Array, " n"],
+        row: Float[Array, "7"],
+    ) -> None:
+        """Adds pairs of views to the normal equations of the twists of the object frame per unknown (`place`; -1:
+        fixed), whatever the errors are. `weights`: of each pair."""
+        store, count, nodes = self._store, len(g), self.relative.size
+        whole, right = np.zeros((6 * count + nodes,) * 2), np.zeros(6 * count + nodes)
+        kernels.add_pairs(
+            poses, pairs, weights, np.where(place >= 0, 6 * place, -1), self._grid, self._side, self._boxes,
+            self.relative, SHADING_SIGMA, store.maps, store.samples, store.table, store.rectified.focal,
+            store.rectified.center, row, whole, right,
+        )  # fmt: skip
+        prior = self._prior / self._shared
+        among = whole[6 * count :, 6 * count :]
+        among[np.diag_indices(nodes)] += prior
+        right[6 * count :] += prior * self.relative.ravel()
+        crossed = whole[6 * count :, : 6 * count]
+        sides = np.concatenate([crossed, right[6 * count :, None]], 1)
+        self._gain = cho_solve(cho_factor(among, lower=True, overwrite_a=True), sides, overwrite_b=False)
+        poses_only = whole[: 6 * count, : 6 * count] - crossed.T @ self._gain[:, :-1]
+        H += poses_only.reshape(count, 6, count, 6).transpose(0, 2, 1, 3)
+        g += (right[: 6 * count] - crossed.T @ self._gain[:, -1]).reshape(count, 6)
+
+    def follow(self, twists: Float[Array, "f 6"]) -> None:
+        """The errors that go with a step of the poses since the last `add`."""
+        step = -(self._gain[:, -1] + self._gain[:, :-1] @ twists.ravel())
+        moved = self.relative + np.clip(step, -MOST_STEP, MOST_STEP).reshape(self.relative.shape)
+        self.relative = np.clip(moved, -MOST_ERROR, MOST_ERROR)
+
+
+def _spans(store: ViewStore, index: Int[Array, " c"]) -> tuple[Float[Array, "c 4"], Float[Array, " c"]]:
+    """Where each view's samples lie in the image (first u, v, width, height in pixels), and their median depth (m)."""
+    (fx, fy), (cx, cy) = store.rectified.focal, store.rectified.center
+    spans, depth_m = np.zeros((len(index), 4)), np.ones(len(index))
+    for row, i in enumerate(index):
+        first, count = store.table[i, lay.FIRST], store.table[i, lay.COUNT]
+        x, y, z = store.samples[first : first + count, : lay.PZ + 1].astype(np.float64).T
+        u, v = fx * x / z + cx, fy * y / z + cy
+        spans[row] = u.min(), v.min(), np.ptp(u), np.ptp(v)
+        depth_m[row] = np.median(z)
+    return spans, depth_m
