@@ -183,7 +183,7 @@ def refine(
     figures = np.zeros((len(pairs), 3))
     H = np.eye(6 * (int(place.max(initial=-1)) + 1))
     errs = config.depth_errors
-    errors = None if errs is None else DepthErrors(store, use, errs, config.shared_noise)
+    errors = None if errs is None else DepthErrors(store, use, errs, config.shared_noise, config.sure_cost)
     for row in rows(config.schedule, distance, config.round_body):
         for _ in range(int(row[k.STEPS])):
             H, g, figures = _normal_equations(store, poses, use, pairs, place, row, motion, config, priors, errors)
@@ -222,13 +222,13 @@ def _normal_equations(
     priors: Sequence[Terms], errors: DepthErrors | None,
 ) -> tuple[Float[Array, "f f"], Float[Array, " f"], Float[Array, "m 3"]]:  # fmt: skip
     count = int(place.max()) + 1
-    blocks, gradients, figures = compared(store, poses, pairs, row, shaded=not config.round_body)
-    weight = 1.0 / (1.0 + (figures[:, 0] / config.sure_cost) ** 2) / config.shared_noise
     H, g = np.zeros((count, count, 6, 6)), np.zeros((count, 6))
     if errors is None:
+        blocks, gradients, figures = compared(store, poses, pairs, row, shaded=not config.round_body)
+        weight = 1.0 / (1.0 + (figures[:, 0] / config.sure_cost) ** 2) / config.shared_noise
         add_pairs(H, g, blocks * weight[:, None, None], gradients * weight[:, None], place[pairs])
     else:
-        errors.add(H, g, poses, pairs, weight, place, row)
+        figures = errors.add(H, g, poses, pairs, place, row)
     _add_motion(H, g, poses, use, place, motion, config)
     for terms in priors:
         terms.add(H, g, poses, place)

@@ -31,11 +31,13 @@ MOST_STEP, MOST_ERROR = 0.01, 0.06
 
 
 class DepthErrors:
-    """The errors of some views' depth, beside their poses. Weights of pairs, and those of the errors' own standard
-    deviation, are divided by `shared`, as everything that images say is."""
+    """The errors of some views' depth, beside their poses. What pairs say and what the noise says of the errors are
+    divided by `shared`, as all that images say is; pairs that cost more than `sure_cost` count less."""
 
-    def __init__(self, store: ViewStore, views: Bool[Array, " v"], noise: DepthNoise, shared: float) -> None:
-        self._store, self._shared = store, shared
+    def __init__(
+        self, store: ViewStore, views: Bool[Array, " v"], noise: DepthNoise, shared: float, sure_cost: float
+    ) -> None:
+        self._store, self._shared, self._sure_cost = store, shared, sure_cost
         index = np.flatnonzero(views)
         self._grid = np.full(len(views), -1)
         self._grid[index] = np.arange(len(index))
@@ -58,29 +60,29 @@ class DepthErrors:
         g: Float[Array, "f 6"],
         poses: Float[Array, "n 4 4"],
         pairs: Int[Array, "m 2"],
-        weights: Float[Array, " m"],
         place: Int[Array, " n"],
         row: Float[Array, "7"],
-    ) -> None:
+    ) -> Float[Array, "m 3"]:
         """Adds pairs of views to the normal equations of the twists of the object frame per unknown (`place`; -1:
-        fixed), whatever the errors are. `weights`: of each pair."""
+        fixed), whatever the errors are. Returns the pairs' figures at the corrected depth."""
         store, count, nodes = self._store, len(g), self.relative.size
         whole, right = np.zeros((6 * count + nodes,) * 2), np.zeros(6 * count + nodes)
+        figures = np.zeros((len(pairs), 3))
         kernels.add_pairs(
-            poses, pairs, weights, np.where(place >= 0, 6 * place, -1), self._grid, self._side, self._boxes,
+            poses, pairs, self._sure_cost, np.where(place >= 0, 6 * place, -1), self._grid, self._side, self._boxes,
             self.relative, SHADING_SIGMA, store.maps, store.samples, store.table, store.rectified.focal,
-            store.rectified.center, row, whole, right,
+            store.rectified.center, row, whole, right, figures,
         )  # fmt: skip
-        prior = self._prior / self._shared
         among = whole[6 * count :, 6 * count :]
-        among[np.diag_indices(nodes)] += prior
-        right[6 * count :] += prior * self.relative.ravel()
+        among[np.diag_indices(nodes)] += self._prior
+        right[6 * count :] += self._prior * self.relative.ravel()
         crossed = whole[6 * count :, : 6 * count]
         sides = np.concatenate([crossed, right[6 * count :, None]], 1)
         self._gain = cho_solve(cho_factor(among, lower=True, overwrite_a=True), sides, overwrite_b=False)
         poses_only = whole[: 6 * count, : 6 * count] - crossed.T @ self._gain[:, :-1]
-        H += poses_only.reshape(count, 6, count, 6).transpose(0, 2, 1, 3)
-        g += (right[: 6 * count] - crossed.T @ self._gain[:, -1]).reshape(count, 6)
+        H += poses_only.reshape(count, 6, count, 6).transpose(0, 2, 1, 3) / self._shared
+        g += (right[: 6 * count] - crossed.T @ self._gain[:, -1]).reshape(count, 6) / self._shared
+        return figures
 
     def follow(self, twists: Float[Array, "f 6"]) -> None:
         """The errors that go with a step of the poses since the last `add`."""

@@ -38,9 +38,11 @@ from processing.sensor.view_layout import (
     Z,
 )
 from processing.track.kernels import (
+    COVERED_COST,
     GEOMETRY_M,
     INTENSITY,
     LEVEL,
+    ODD_COST,
     OUTLINE_M,
     SHADING,
     SHARE,
@@ -101,7 +103,8 @@ def pair_terms(  # noqa: C901
 
     pose: 4x4 other_from_sample_camera. boxes (2, 4), errors (2, nodes): grids (`nodes_around`) and relative errors of
     both views' depth. H, g: of the twist of the points in the other camera's frame, of the pair's shading, of the
-    sampled view's errors, and of the other one's.
+    sampled view's errors, and of the other one's. Returns cost sum, points counted, points on the surface, violations,
+    as `track/kernels.py` does.
     """
     # long because: one compiled loop over points, as in track/kernels.py
     off, u0, v0, w, h = row[OFFSET], row[U0], row[V0], row[WIDTH], row[HEIGHT]
@@ -113,8 +116,10 @@ def pair_terms(  # noqa: C901
     own, own_share = np.empty(CORNERS, np.int64), np.empty(CORNERS)
     other, other_share = np.empty(CORNERS, np.int64), np.empty(CORNERS)
     slope, moved = np.empty(3), np.empty(3)
+    cost, seen, on, against = 0.0, 0, 0, 0
     for i in range(0, samples.shape[0], step):
         p = samples[i]
+        seen += 1
         nodes_around(fx * p[PX] / p[PZ] + cx, fy * p[PY] / p[PZ] + cy, boxes[0], side, own, own_share)
         longer = 1.0
         for a in range(CORNERS):
@@ -124,20 +129,26 @@ def pair_terms(  # noqa: C901
             moved[a] = pose[a, 0] * p[PX] + pose[a, 1] * p[PY] + pose[a, 2] * p[PZ]
         x, y, z = longer * moved[0] + pose[0, 3], longer * moved[1] + pose[1, 3], longer * moved[2] + pose[2, 3]
         if z < 0.05:
+            cost += 1.0
             continue
         iz = 1.0 / z
         u = fx * x * iz + cx - u0
         v = fy * y * iz + cy - v0
         iu, iv = int(np.floor(u + 0.5)), int(np.floor(v + 0.5))
         if iu < 1 or iv < 1 or iu >= w - 2 or iv >= h - 2:
+            cost += 1.0
+            against += 1
             continue
         near = off + iv * w + iu
         out = maps[near, OUTSIDE]
         if out < 0.0:
+            seen -= 1
             continue
         if out > 0.0:
             gap = out * z / fx
             r = gap / s_out
+            cost += min(r * r / 9.0, 1.0)
+            against += 1
             if r < 6.0 and s_out < 1.0:
                 slope[0] = 0.5 * (max(maps[near + 1, OUTSIDE], 0.0) - max(maps[near - 1, OUTSIDE], 0.0))
                 slope[1] = 0.5 * (max(maps[near + w, OUTSIDE], 0.0) - max(maps[near - w, OUTSIDE], 0.0)) * fy / fx
@@ -150,17 +161,20 @@ def pair_terms(  # noqa: C901
         my = pose[1, 0] * p[SNX] + pose[1, 1] * p[SNY] + pose[1, 2] * p[SNZ]
         mz = pose[2, 0] * p[SNX] + pose[2, 1] * p[SNY] + pose[2, 2] * p[SNZ]
         if (mx * x + my * y + mz * z) * iz > -0.1:  # faces away from the other camera: cannot be compared
+            seen -= 1
             continue
         fits = maps[near, Z] <= 0.0
-        if not fits:
+        if fits:
+            cost += 0.5 * COVERED_COST
+        else:
             nx, ny, nz = maps[near, NX], maps[near, NY], maps[near, NZ]
             nodes_around(u + u0, v + v0, boxes[1], side, other, other_share)
             zr = depth_at(maps, row, fx, fy, cx, cy, u, v, x, y, iz)
             stretch = 1.0
             for a in range(CORNERS):
                 stretch += other_share[a] * errors[1, other[a]]
-            ahead = nx * x + ny * y + nz * z
-            r_m = ahead * (1.0 - stretch * zr * iz)
+            toward = nx * x + ny * y + nz * z
+            r_m = toward * (1.0 - stretch * zr * iz)
             r = r_m / s_geo
             if abs(r) < 3.0 and nx * mx + ny * my + nz * mz > 0.5:
                 fits = True
@@ -169,19 +183,31 @@ def pair_terms(  # noqa: C901
                 _derivatives(slope, moved, x, y, z, at, J)
                 for a in range(CORNERS):
                     at[TWIST + CORNERS + a] = POSE + nodes + other[a]
-                    J[TWIST + CORNERS + a] = -ahead * zr * iz * other_share[a]
+                    J[TWIST + CORNERS + a] = -toward * zr * iz * other_share[a]
                 k = 1.0 - r * r / 9.0
                 _add(at, J, TWIST + 2 * CORNERS, r_m, wg * k * k, H, g)
+                on += 1
+                cost += 0.5 * min(r * r / 9.0, 1.0)
+            else:
+                ahead = stretch * zr - z  # positive: the point lies in front of what this view sees
+                if ahead > 3.0 * s_geo:
+                    cost += min(0.5 + ahead / (12.0 * s_geo), 1.0)
+                    against += 1
+                else:
+                    cost += COVERED_COST if ahead < -3.0 * s_geo else ODD_COST
         if fits:
             ju, jv = int(np.floor(u)), int(np.floor(v))
             q = off + jv * w + ju
             ch = SHARP + level * APPEARANCE
             foreign = max(max(maps[q, ch], maps[q + 1, ch]), max(maps[q + w, ch], maps[q + w + 1, ch]))
             if max(foreign, p[SSHARP]) > 0.5 * NO_APPEARANCE:
+                cost += 0.5 * COVERED_COST
                 continue
             for c in range(APPEARANCE):
                 ch = level * APPEARANCE + c
                 e, k, gu, gv = appearance_step(maps, q, w, u - ju, v - jv, ch, p[SSHARP + ch], s_int)
+                r = e / s_int
+                cost += 0.5 / APPEARANCE * min(r * r / 9.0, 1.0)
                 if k > 0.0:
                     slope[0], slope[1] = gu * fx * iz, gv * fy * iz
                     slope[2] = -(slope[0] * x + slope[1] * y) * iz
@@ -192,6 +218,7 @@ def pair_terms(  # noqa: C901
                         at[first + a] = TWIST + 3 * c + a
                     J[first], J[first + 1], J[first + 2] = p[SNX] - mx, p[SNY] - my, p[SNZ] - mz
                     _add(at, J, first + 3, e, wi * k, H, g)
+    return cost, seen, on, against
 
 
 @no_type_check
@@ -215,11 +242,13 @@ def _without_shading(H, g, sigma):
 @no_type_check
 @njit(cache=True, error_model="numpy", nogil=True)
 def add_pairs(
-    poses, pairs, weights, places, grids, side, boxes, errors, sigma, maps, samples, table, focal, center, row, H, g
-):
+    poses, pairs, sure_cost, places, grids, side, boxes, errors, sigma, maps, samples, table, focal, center, row, H, g,
+    figures,
+):  # fmt: skip
     """Adds normal equations of pairs (i, k) of views: points of view i in view k, both of whose depth errs.
 
-    weights (m): of each pair. places (v), grids (v): first unknown of a view's twist (of the object frame; -1: fixed)
+    A pair that costs more than `sure_cost` counts less. figures (m, 3): mean cost, share on the surface, share of
+    violations. places (v), grids (v): first unknown of a view's twist (of the object frame; -1: fixed)
     and number of its grid among `boxes` (c, 4) and `errors` (c, nodes); errors come after all twists, in H and g.
     sigma: standard deviation of a pair's shading.
     """
@@ -239,10 +268,12 @@ def add_pairs(
         both[0], both[1] = errors[grids[i]], errors[grids[k]]
         mine = samples[table[i, FIRST] : table[i, FIRST] + table[i, COUNT]]
         H1[:], g1[:] = 0.0, 0.0
-        pair_terms(
+        cost, seen, on, against = pair_terms(
             mine, step, poses[k] @ inverse(poses[i]), maps, table[k], focal, center, int(row[LEVEL]), row[GEOMETRY_M],
             row[INTENSITY], row[OUTLINE_M], side, both_boxes, both, H1, g1,
         )  # fmt: skip
+        n = max(1, seen)
+        figures[m, 0], figures[m, 1], figures[m, 2] = cost / n, on / n, against / n
         H2, g2 = _without_shading(H1, g1, sigma)
         A = adjoint(poses[k])  # the twist of the points is A times that of i's object frame less that of k's
         H2[:TWIST] = A.T @ np.ascontiguousarray(H2[:TWIST])
@@ -257,7 +288,7 @@ def add_pairs(
         for a in range(count):
             if place[a] < 0:
                 continue
-            weight = weights[m] * sign[a]
+            weight = sign[a] / (1.0 + (figures[m, 0] / sure_cost) ** 2)
             g[place[a]] += weight * g2[source[a]]
             for b in range(count):
                 if place[b] >= 0:

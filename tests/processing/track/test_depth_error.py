@@ -141,6 +141,6 @@ def test_what_a_pair_pulls_at_changes_with_an_error_as_its_normal_equations_say(
 
 def test_grids_are_as_fine_as_depth_errs_alike_and_no_finer_than_can_be_solved_for() -> None:
     store = store_of(turned_poses(3), 0.0)
-    sides = [round(DepthErrors(store, np.ones(3, dtype=bool), DepthNoise(0.005, px), 8.0).relative.shape[1] ** 0.5)
+    sides = [round(DepthErrors(store, np.ones(3, dtype=bool), DepthNoise(0.005, px), 8.0, 0.1).relative.shape[1] ** 0.5)
              for px in (4.0, 400.0, 1e6)]  # fmt: skip
     assert sides == [6, 4, 3]
