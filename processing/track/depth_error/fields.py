@@ -26,6 +26,9 @@ LEAST_SIDE, MOST_SIDE = 3, 6
 MOST_NODES = 2400
 """Of all views together: more would take longer to solve for than all else."""
 LEAST_PX = 4.0
+OFFSET_SHARE = 0.01
+"""Standard deviation of a view's mean error, as a share of one node's: what all of a view's depth errs by alike is left
+to its pose, which it would shift along the ray."""
 MOST_STEP, MOST_ERROR = 0.01, 0.06
 """Errors change by no more than this in a step, and grow no larger (relative)."""
 
@@ -50,7 +53,10 @@ class DepthErrors:
         self._boxes = spans
         sigma = noise.sigma_at_1m * depth_m  # that of depth grows with the square of the distance
         nodes = self._side**2
-        self._prior = np.repeat(sigma**-2.0, nodes)
+        self._prior = np.zeros((len(index) * nodes,) * 2)
+        for row, mean in enumerate(_means(store, index, self._boxes, self._side)):
+            own = slice(row * nodes, (row + 1) * nodes)
+            self._prior[own, own] = (np.eye(nodes) + np.outer(mean, mean) / OFFSET_SHARE**2) / sigma[row] ** 2
         self.relative = np.zeros((len(index), nodes))
         """Of depth, at each node."""
 
@@ -74,8 +80,8 @@ class DepthErrors:
             store.rectified.center, row, whole, right, figures,
         )  # fmt: skip
         among = whole[6 * count :, 6 * count :]
-        among[np.diag_indices(nodes)] += self._prior
-        right[6 * count :] += self._prior * self.relative.ravel()
+        among += self._prior
+        right[6 * count :] += self._prior @ self.relative.ravel()
         crossed = whole[6 * count :, : 6 * count]
         sides = np.concatenate([crossed, right[6 * count :, None]], 1)
         self._gain = cho_solve(cho_factor(among, lower=True, overwrite_a=True), sides, overwrite_b=False)
@@ -102,3 +108,16 @@ def _spans(store: ViewStore, index: Int[Array, " c"]) -> tuple[Float[Array, "c 4
         spans[row] = u.min(), v.min(), np.ptp(u), np.ptp(v)
         depth_m[row] = np.median(z)
     return spans, depth_m
+
+
+def _means(store: ViewStore, index: Int[Array, " c"], boxes: Float[Array, "c 4"], side: int) -> Float[Array, "c k"]:
+    """What each node of a view's grid adds to the mean error of its samples."""
+    (fx, fy), (cx, cy) = store.rectified.focal, store.rectified.center
+    out = np.zeros((len(index), side * side))
+    at, share = np.zeros(kernels.CORNERS, dtype=np.int64), np.zeros(kernels.CORNERS)
+    for row, i in enumerate(index):
+        first, count = store.table[i, lay.FIRST], store.table[i, lay.COUNT]
+        for x, y, z in store.samples[first : first + count, : lay.PZ + 1].astype(np.float64):
+            kernels.nodes_around(fx * x / z + cx, fy * y / z + cy, boxes[row], side, at, share)
+            out[row, at] += share / count
+    return out

@@ -91,6 +91,19 @@ def test_depth_that_hardly_errs_is_taken_as_it_is() -> None:
     assert turned_wrongly_deg(exact, poses) == pytest.approx(turned_wrongly_deg(taken, poses), abs=0.1)
 
 
+def test_what_all_depth_of_a_view_errs_by_alike_is_left_to_its_pose() -> None:
+    store, every = store_of(turned_poses(3), 0.0), np.ones(3, dtype=bool)
+    errors = DepthErrors(store, every, NOISE, 8.0, 0.1)
+    poses = turned_poses(3)
+    poses[1, 2, 3] += 0.004
+    pairs = np.array([[i, j] for i in range(3) for j in range(3) if i != j])
+    row = np.array([0, 1, 0.0035, 0.08, 0.004, 1.0, 0.0])
+    errors.add(np.zeros((1, 1, 6, 6)), np.zeros((1, 6)), poses, pairs, np.array([-1, 0, -1]), row)
+    errors.follow(np.zeros((1, 6)))
+    assert np.abs(errors.relative[1]).max() > 1e-3  # the views disagree, and the pose does not move here ...
+    assert abs(errors.relative[1].mean()) < 0.2 * np.abs(errors.relative[1]).max()  # ... but the mean does not follow
+
+
 def test_poses_are_known_less_well_where_depth_may_err() -> None:
     poses = turned_poses(3)
     exact, erring = (refined(poses, 0.0, noise).covariance for noise in (DepthNoise(1e-6, 200.0), NOISE))
