@@ -50,8 +50,8 @@ class HypothesisConfig:
     depth_noise: DepthNoise = PUBLISHED
     """How depth errs: solved for with the poses in the last refinement of the best hypothesis ..."""
     finest: Schedule = ((0, 12, 0.0035, 0.08, 0.004, 1.0),)
-    """... with these scales. Outlines of masks are off by 1.3 to 3 px (means of tosses of `choose`): .004 m at 0.8 m are
-    2.4 px of a camera of 480 px focal length."""
+    """... with these scales. Outlines of masks are off by 1.3 to 3 px (means of tosses of `choose`): .004 m at 0.8 m
+    are 2.4 px of a camera of 480 px focal length."""
     steady: GraphConfig = field(default_factory=steady_motion)
     """Refinement that trusts steady motion more than what the images show."""
     agreeing_deg: float = 4.0
