@@ -85,9 +85,10 @@ def test_depth_that_is_tilted_alike_in_every_picture_turns_a_body_less_where_it_
     assert solved < 0.6 * taken
 
 
-def test_depth_that_hardly_errs_is_taken_as_it_is() -> None:
+@pytest.mark.parametrize("sigma_at_1m", [0.0, 1e-5])
+def test_depth_that_hardly_errs_is_taken_as_it_is(sigma_at_1m: float) -> None:
     poses = turned_poses(4)
-    exact, taken = (refined(poses, 0.0, noise).poses for noise in (DepthNoise(1e-5, 200.0), None))
+    exact, taken = (refined(poses, 0.0, noise).poses for noise in (DepthNoise(sigma_at_1m, 200.0), None))
     assert turned_wrongly_deg(exact, poses) == pytest.approx(turned_wrongly_deg(taken, poses), abs=0.1)
 
 
