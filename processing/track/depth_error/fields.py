@@ -22,7 +22,7 @@ from processing.track.depth_error import kernels
 from processing.track.pairs import SHADING_SIGMA
 
 LEAST_SIDE, MOST_SIDE = 3, 6
-"""Nodes along a side of a grid: of five tosses of `choose`, eight instead of five a side gain .1 degrees in the mean."""
+"""Nodes along a side of a grid: of five tosses of `choose`, eight instead of five a side gain .1 degree in the mean."""
 MOST_NODES = 2400
 """Of all views together: more would take longer to solve for than all else."""
 LEAST_PX = 4.0
