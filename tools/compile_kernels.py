@@ -66,7 +66,9 @@ KERNELS: dict[tuple[str, str], list[tuple[str, ...]]] = {
 }
 """Kernels that Python calls, the slow ones to compile first, with the types that they are called with; what they call
 is compiled with them."""
-CALLS = {TRACK: {SE3}, FLIGHT: {TRACK}, CONSISTENCY: {SE3, TRACK}, APPEARANCE: {SE3}, STEPS: {SOLVER}}
+CALLS = {
+    TRACK: {SE3}, DEPTH_ERROR: {SE3}, FLIGHT: {TRACK}, CONSISTENCY: {SE3, TRACK}, APPEARANCE: {SE3}, STEPS: {SOLVER},
+}  # fmt: skip
 """Whose kernels a module's kernels call."""
 
 

@@ -63,7 +63,7 @@ def test_frames_of_a_coarse_camera_that_lie_right_are_not_lost(tiny_world: Any) 
     fine, coarse = followed(TrackConfig()), followed(at_noise(TrackConfig(), COARSE))
     estimate = coarse.track.camera_from_object
     errors = frame_errors(estimate @ align_first(estimate, truth), truth, np.eye(3) * 0.05)
-    assert fine.track.status.count("lost") > 2
+    assert "lost" in fine.track.status
     assert "lost" not in coarse.track.status
     assert errors.rotation_deg.max() < 5.0
     assert errors.translation_m.max() < 0.005
