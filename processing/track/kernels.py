@@ -71,7 +71,7 @@ def depth_at(maps, row, fx, fy, cx, cy, u, v, x, y, iz):
         return (z00 * (1 - a) + z10 * a) * (1 - b) + (z01 * (1 - a) + z11 * a) * b
     iu, iv = int(np.floor(u + 0.5)), int(np.floor(v + 0.5))
     near = off + iv * w + iu
-    zr = maps[near, Z] * 1.0
+    zr = maps[near, Z]
     nx, ny, nz = maps[near, NX], maps[near, NY], maps[near, NZ]
     px, py = (iu + u0 - cx) / fx, (iv + v0 - cy) / fy
     top = nx * px + ny * py + nz
@@ -79,6 +79,24 @@ def depth_at(maps, row, fx, fy, cx, cy, u, v, x, y, iz):
     if abs(bottom) > 0.05:
         zr = zr * top / bottom
     return zr
+
+
+@no_type_check
+@njit(cache=True, error_model="numpy", nogil=True, fastmath=True, inline="always")
+def outline_slope(maps, near, w, aspect, x, y, iz):
+    """How the distance (m) of a point to the outline changes with its x, y and z; `aspect`: fy / fx."""
+    du = 0.5 * (max(maps[near + 1, OUTSIDE], 0.0) - max(maps[near - 1, OUTSIDE], 0.0))
+    dv = 0.5 * (max(maps[near + w, OUTSIDE], 0.0) - max(maps[near - w, OUTSIDE], 0.0)) * aspect
+    return du, dv, -(du * x + dv * y) * iz
+
+
+@no_type_check
+@njit(cache=True, error_model="numpy", nogil=True, fastmath=True, inline="always")
+def cost_off_surface(ahead, s_geo):
+    """Of a point that is not on the surface another view sees: `ahead` (m) of it, a violation; covered; or odd."""
+    if ahead > 3.0 * s_geo:
+        return min(0.5 + ahead / (12.0 * s_geo), 1.0)
+    return COVERED_COST if ahead < -3.0 * s_geo else ODD_COST
 
 
 @no_type_check
@@ -151,10 +169,7 @@ def pair_terms(  # noqa: C901
             against += 1
             if r < 6.0 and s_out < 1.0:
                 k = wo / (1.0 + r * r / 4.0)
-                du = 0.5 * (max(maps[near + 1, OUTSIDE], 0.0) - max(maps[near - 1, OUTSIDE], 0.0))
-                dv = 0.5 * (max(maps[near + w, OUTSIDE], 0.0) - max(maps[near - w, OUTSIDE], 0.0))
-                J[0], J[1] = du, dv * fy / fx
-                J[2] = -(du * x + dv * fy / fx * y) * iz
+                J[0], J[1], J[2] = outline_slope(maps, near, w, fy / fx, x, y, iz)
                 add_residual(J, x, y, z, gap, k, H, g)
             continue
         mx = pose[0, 0] * p[SNX] + pose[0, 1] * p[SNY] + pose[0, 2] * p[SNZ]
@@ -189,11 +204,9 @@ def pair_terms(  # noqa: C901
                 J[0], J[1], J[2] = nx, ny, nz
                 add_residual(J, x, y, z, r_m, wg * k * k, Hd, gd)
                 cost += 0.5 * min(r * r / 9.0, 1.0)
-            elif ahead > 3.0 * s_geo:
-                cost += min(0.5 + ahead / (12.0 * s_geo), 1.0)
-                against += 1
             else:
-                cost += COVERED_COST if ahead < -3.0 * s_geo else ODD_COST
+                cost += cost_off_surface(ahead, s_geo)
+                against += ahead > 3.0 * s_geo
         if fits:
             ju, jv = int(np.floor(u)), int(np.floor(v))
             a, b = u - ju, v - jv

@@ -55,10 +55,9 @@ class DepthErrors:
         self._boxes = spans
         sigma = max(noise.sigma_at_1m, LEAST_SIGMA) * depth_m  # that of depth grows with the square of the distance
         nodes = self._side**2
-        self._prior = np.zeros((len(index) * nodes,) * 2)
-        for row, mean in enumerate(_means(store, index, self._boxes, self._side)):
-            own = slice(row * nodes, (row + 1) * nodes)
-            self._prior[own, own] = (np.eye(nodes) + np.outer(mean, mean) / OFFSET_SHARE**2) / sigma[row] ** 2
+        mean = _means(store, index, self._boxes, self._side)
+        alike = mean[:, :, None] * mean[:, None] / OFFSET_SHARE**2
+        self._prior = (np.eye(nodes) + alike) / sigma[:, None, None] ** 2
         self.relative = np.zeros((len(index), nodes))
         """Of depth, at each node."""
 
@@ -82,11 +81,13 @@ class DepthErrors:
             store.rectified.center, row, whole, right, figures,
         )  # fmt: skip
         among = whole[6 * count :, 6 * count :]
-        among += self._prior
-        right[6 * count :] += self._prior @ self.relative.ravel()
+        for grid, prior in enumerate(self._prior):
+            own = slice(grid * len(prior), (grid + 1) * len(prior))
+            among[own, own] += prior
+        right[6 * count :] += np.einsum("cij,cj->ci", self._prior, self.relative).ravel()
         crossed = whole[6 * count :, : 6 * count]
         sides = np.concatenate([crossed, right[6 * count :, None]], 1)
-        self._gain = cho_solve(cho_factor(among, lower=True, overwrite_a=True), sides, overwrite_b=False)
+        self._gain = cho_solve(cho_factor(among, lower=True, overwrite_a=True), sides)
         poses_only = whole[: 6 * count, : 6 * count] - crossed.T @ self._gain[:, :-1]
         H += poses_only.reshape(count, 6, count, 6).transpose(0, 2, 1, 3) / self._shared
         g += (right[: 6 * count] - crossed.T @ self._gain[:, -1]).reshape(count, 6) / self._shared

@@ -42,12 +42,13 @@ from processing.track.kernels import (
     GEOMETRY_M,
     INTENSITY,
     LEVEL,
-    ODD_COST,
     OUTLINE_M,
     SHADING,
     SHARE,
     appearance_step,
+    cost_off_surface,
     depth_at,
+    outline_slope,
 )
 
 TWIST = 6
@@ -84,14 +85,14 @@ def _add(at, J, count, r, weight, H, g):
 
 @no_type_check
 @njit(cache=True, error_model="numpy", nogil=True)
-def _derivatives(slope, moved, x, y, z, at, J):
+def _derivatives(slope, moved, x, y, z, share, J):
     """Those of a residual whose derivative by the point is `slope`: by the twist, then by the errors at the point's own
-    nodes (whose numbers and shares J and `at` hold from TWIST on), along whose ray the point moves by `moved`."""
+    nodes, whose shares are `share`: it moves by `moved` along its ray."""
     along = slope[0] * moved[0] + slope[1] * moved[1] + slope[2] * moved[2]
     J[0], J[1], J[2] = slope[0], slope[1], slope[2]
     J[3], J[4], J[5] = y * slope[2] - z * slope[1], z * slope[0] - x * slope[2], x * slope[1] - y * slope[0]
     for a in range(CORNERS):
-        J[TWIST + a] *= along
+        J[TWIST + a] = share[a] * along
 
 
 @no_type_check
@@ -150,11 +151,8 @@ def pair_terms(  # noqa: C901
             cost += min(r * r / 9.0, 1.0)
             against += 1
             if r < 6.0 and s_out < 1.0:
-                slope[0] = 0.5 * (max(maps[near + 1, OUTSIDE], 0.0) - max(maps[near - 1, OUTSIDE], 0.0))
-                slope[1] = 0.5 * (max(maps[near + w, OUTSIDE], 0.0) - max(maps[near - w, OUTSIDE], 0.0)) * fy / fx
-                slope[2] = -(slope[0] * x + slope[1] * y) * iz
-                J[TWIST : TWIST + CORNERS] = own_share
-                _derivatives(slope, moved, x, y, z, at, J)
+                slope[0], slope[1], slope[2] = outline_slope(maps, near, w, fy / fx, x, y, iz)
+                _derivatives(slope, moved, x, y, z, own_share, J)
                 _add(at, J, TWIST + CORNERS, gap, wo / (1.0 + r * r / 4.0), H, g)
             continue
         mx = pose[0, 0] * p[SNX] + pose[0, 1] * p[SNY] + pose[0, 2] * p[SNZ]
@@ -179,8 +177,7 @@ def pair_terms(  # noqa: C901
             if abs(r) < 3.0 and nx * mx + ny * my + nz * mz > 0.5:
                 fits = True
                 slope[0], slope[1], slope[2] = nx, ny, nz
-                J[TWIST : TWIST + CORNERS] = own_share
-                _derivatives(slope, moved, x, y, z, at, J)
+                _derivatives(slope, moved, x, y, z, own_share, J)
                 for a in range(CORNERS):
                     at[TWIST + CORNERS + a] = POSE + nodes + other[a]
                     J[TWIST + CORNERS + a] = -toward * zr * iz * other_share[a]
@@ -190,11 +187,8 @@ def pair_terms(  # noqa: C901
                 cost += 0.5 * min(r * r / 9.0, 1.0)
             else:
                 ahead = stretch * zr - z  # positive: the point lies in front of what this view sees
-                if ahead > 3.0 * s_geo:
-                    cost += min(0.5 + ahead / (12.0 * s_geo), 1.0)
-                    against += 1
-                else:
-                    cost += COVERED_COST if ahead < -3.0 * s_geo else ODD_COST
+                cost += cost_off_surface(ahead, s_geo)
+                against += ahead > 3.0 * s_geo
         if fits:
             ju, jv = int(np.floor(u)), int(np.floor(v))
             q = off + jv * w + ju
@@ -211,8 +205,7 @@ def pair_terms(  # noqa: C901
                 if k > 0.0:
                     slope[0], slope[1] = gu * fx * iz, gv * fy * iz
                     slope[2] = -(slope[0] * x + slope[1] * y) * iz
-                    J[TWIST : TWIST + CORNERS] = own_share
-                    _derivatives(slope, moved, x, y, z, at, J)
+                    _derivatives(slope, moved, x, y, z, own_share, J)
                     first = TWIST + CORNERS
                     for a in range(3):
                         at[first + a] = TWIST + 3 * c + a
