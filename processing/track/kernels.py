@@ -73,8 +73,7 @@ def depth_at(maps, row, fx, fy, cx, cy, u, v, x, y, iz):
     near = off + iv * w + iu
     zr = maps[near, Z]
     nx, ny, nz = maps[near, NX], maps[near, NY], maps[near, NZ]
-    px, py = (iu + u0 - cx) / fx, (iv + v0 - cy) / fy
-    top = nx * px + ny * py + nz
+    top = nx * (iu + u0 - cx) / fx + ny * (iv + v0 - cy) / fy + nz
     bottom = nx * x * iz + ny * y * iz + nz
     if abs(bottom) > 0.05:
         zr = zr * top / bottom
@@ -102,8 +101,8 @@ def cost_off_surface(ahead, s_geo):
 @no_type_check
 @njit(cache=True, error_model="numpy", nogil=True, fastmath=True, inline="always")
 def appearance_step(maps, q, w, a, b, channel, shown, s_int):
-    """What one channel of appearance says between the four pixels from q on: residual against what the point `shown`,
-    weight (0: another surface's, or shading alone), and its change per pixel along u and v."""
+    """Of one channel of appearance between the four pixels from q on: residual against what the point `shown`, weight
+    (0: another surface's), and its change per pixel along u and v."""
     ch = SHARP + channel
     i00, i10, i01, i11 = maps[q, ch], maps[q + 1, ch], maps[q + w, ch], maps[q + w + 1, ch]
     top, bottom = i00 * (1 - a) + i10 * a, i01 * (1 - a) + i11 * a
