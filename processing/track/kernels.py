@@ -62,8 +62,7 @@ def depth_at(maps, row, fx, fy, cx, cy, u, v, x, y, iz):
     surface, else on the plane of the nearest pixel, whose depth is known."""
     off, u0, v0, w = row[OFFSET], row[U0], row[V0], row[WIDTH]
     ju, jv = int(np.floor(u)), int(np.floor(v))
-    a, b = u - ju, v - jv
-    q = off + jv * w + ju
+    a, b, q = u - ju, v - jv, off + jv * w + ju
     z00, z10, z01, z11 = maps[q, Z], maps[q + 1, Z], maps[q + w, Z], maps[q + w + 1, Z]
     low = min(min(z00, z10), min(z01, z11))
     high = max(max(z00, z10), max(z01, z11))
