@@ -19,6 +19,7 @@ from processing.segment.background.depth_scale import DepthScaleSettings
 from processing.segment.background.follow import BackgroundSettings
 from processing.segment.background.static_scene import SceneSettings
 from processing.segment.detect.detection import FindSettings
+from processing.segment.learned.masks import LearnedSettings
 from processing.segment.robot.fit import RobotFitSettings
 from processing.sensor.render import RendererName
 from processing.sensor.still import StillSettings
@@ -71,6 +72,7 @@ class Config:
     scene: SceneSettings = field(default_factory=SceneSettings)
     rig: RigSettings = field(default_factory=RigSettings)
     masks: BackgroundSettings = field(default_factory=BackgroundSettings)
+    learned_masks: LearnedSettings = field(default_factory=LearnedSettings)
     depth_delay: DepthDelaySettings = field(default_factory=DepthDelaySettings)
     find: FindSettings = field(default_factory=FindSettings)
     given_masks: GivenMasks = DEFAULT_MASKS

@@ -12,6 +12,7 @@ from processing.images import Images, every_frame, raw_images
 from processing.pipeline import notices as say
 from processing.pipeline.cycle import run_cycle
 from processing.pipeline.first_pass import first_pass, start_alone
+from processing.pipeline.masks import all_masks, masks_anew
 from processing.pipeline.passes import Pass
 from processing.pipeline.record import write_record
 from processing.run import Run, each, with_noise
@@ -24,7 +25,6 @@ from processing.stages.recording.noise import measure_noise
 from processing.stages.recording.rig import refine_rig
 from processing.stages.recording.scene import learn_static_scene
 from processing.stages.rollout import roll_out
-from processing.stages.segment import segment
 from processing.stages.track import track
 from processing.stages.track_to_model import track_to_model
 from processing.store import Done
@@ -40,7 +40,7 @@ def process(run: Run, variant: Variant, scope: Scope, model: Path | None = None)
     rig = refine_rig(run, scene)
     found = find_object(run, scene, rig)
     run = with_depth_in_time(run, scene, all_masks(run, scene, rig, found))
-    masks = all_masks(run, scene, rig, found)  # read again, but where depth's stamps were wrong
+    masks = masks_anew(run, scene, all_masks(run, scene, rig, found))  # followed again where depth's stamps were wrong
     noise = measure_noise(run, scene)
     run = replace(with_noise(run, noise.result.noise), warnings=(*run.warnings, *say.of_noise(noise)))
     run = without_lost(run, masks)
@@ -53,11 +53,6 @@ def process(run: Run, variant: Variant, scope: Scope, model: Path | None = None)
     else:
         last = together(run, variant, scope, alone, images)
     return write_record(run, variant, scope, last, alone, scene, rig, masks)
-
-
-def all_masks(run: Run, scene: Done, rig: Done, found: Done | None) -> dict[int, Done]:
-    """The object's masks in every toss."""
-    return each(run, run.tosses, lambda t: segment(run, t, scene, rig, found))
 
 
 def with_model(run: Run, images: Mapping[int, Images], model: Path) -> Pass:

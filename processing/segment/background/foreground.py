@@ -125,7 +125,7 @@ def pixel_log_odds(
     often it is seen well inside of the object, and how often around it. `likeness` (log-odds of the object's colours)
     stands in for the scene's colour where that is not known.
     """
-    color, depth, part = frame.color_rgb[at].astype(np.float32), frame.depth_m[at], _cut(scene, at)
+    color, depth, part = frame.color_rgb[at].astype(np.float32), frame.depth_m[at], cut(scene, at)
     solid = rough[at].astype(np.uint8)
     core, band = cv2.erode(solid, kernel(s.band_inside_px)) > 0, cv2.dilate(solid, kernel(s.band_outside_px)) > 0
     nearer = nearer_than_scene(depth, part, s)
@@ -268,7 +268,8 @@ def fill_holes(mask: Bool[Array, "h w"], largest_share: float = 0.05) -> Bool[Ar
     return out
 
 
-def _cut(scene: StaticScene, at: Window) -> StaticScene:
+def cut(scene: StaticScene, at: Window) -> StaticScene:
+    """A window of the static scene."""
     return StaticScene(
         scene.depth_m[at],
         scene.depth_sigma_m[at],
