@@ -40,9 +40,14 @@ def learned_masks(
         def network_of(i: int) -> PixelNetwork:
             return networks[1 - half_of(toss, i, s)]
 
-        def drawn(i: int, mask: Bool[Array, "h w"]) -> Judged | None:
+        def drawn(i: int, mask: Bool[Array, "h w"], rough: bool = False) -> Judged | None:
             found = seen.look(i, mask)
-            return None if found is None else redrawn(found, network_of(i), mask.shape, seen.settings, s)
+            return None if found is None else redrawn(found, network_of(i), mask.shape, seen.settings, s, rough)
+
+        def drawn_roughly(i: int, mask: Bool[Array, "h w"]) -> Judged | None:
+            found = drawn(i, seen.free(i, mask), rough=True)
+            fine = None if found is None else drawn(i, found.mask)
+            return found if found is None or fine is None else replace(fine, support=found.support)
 
         judged = []
         for i, mask in enumerate(seen.masks):
@@ -52,7 +57,7 @@ def learned_masks(
         judged = found_again(
             judged, seen.sizes_px**2, [i in given for i in range(len(judged))],
             lambda i, at: network_of(i).log_odds(seen.features(i, at)),
-            lambda i, mask: drawn(i, seen.free(i, mask)), s.again,
+            drawn_roughly, s.again,
         )  # fmt: skip
         write_masks(folder, toss, [j.mask for j in judged], np.array([j.sure for j in judged]))
         for name in (f"toss_{toss:02d}.robot", f"toss_{toss:02d}.hand.npy"):

@@ -29,11 +29,12 @@ class AgainSettings:
     doubted: float = 0.9
     """A mask is doubted whose support is less than this share of what is usual in its toss; so is an empty one, ..."""
     cut: float = 0.6
-    """... and one that is smaller than this share of the object's size in the frames around."""
+    """... and one smaller than this share of the object's area in the frames around, or larger by its inverse."""
     found: float = 0.6
     """The object is taken for found with this share of the usual support ..."""
     better: float = 0.05
-    """... and so much more than the doubted mask has; so much less will do where the mask before was replaced."""
+    """... and so much more than the doubted mask has; so much less will do where the mask before
+    was replaced, or this one is far too large."""
     other: float = 0.7
     """Two masks that agree less than this (intersection over union) are of different things."""
     most_missed: int = 2
@@ -66,16 +67,20 @@ def found_again(
     the frames before, then from those after. `usual_px`: the object's area in the frames around each; `fixed` ones are
     never doubted."""
     found = list(judged)
-    usual = float(np.median([j.support for j in judged if j.mask.any()] or [0.0]))
-    cut = {i for i, j in enumerate(judged) if not fixed[i] and j.mask.sum() < s.cut * usual_px[i]}
-    doubted = cut | {i for i, j in enumerate(judged) if not fixed[i] and j.support < s.doubted * usual}
+    free = [i for i in range(len(found)) if not fixed[i]]
+    usual = float(np.median([judged[i].support for i in free if judged[i].support > 0] or [0.0]))
+    cut = {i for i in free if judged[i].mask.sum() < s.cut * usual_px[i]}
+    large = {i for i in free if s.cut * judged[i].mask.sum() > usual_px[i]}
+    doubted = cut | large | {i for i in free if judged[i].support < s.doubted * usual}
     for order in (range(len(found)), range(len(found) - 1, -1, -1)):
         known: list[int] = []
         replaced = -9
         for i in order:
             if i in doubted and known and abs(i - known[-1]) <= s.most_missed + 1:
                 seen = _followed(found, known, i, odds_in, draw, s)
-                if seen is not None and _better(seen, found[i], usual, known[-1] == replaced, i in cut, s):
+                if seen is not None and _better(
+                    seen, found[i], usual, known[-1] == replaced or i in large, i in cut, s
+                ):
                     doubted.discard(i)  # found where it was, else elsewhere
                     if overlap(seen.mask, found[i].mask) < s.other:
                         found[i], replaced = seen, i
@@ -84,12 +89,12 @@ def found_again(
     return found
 
 
-def _better(new: Judged, old: Judged, usual: float, follows: bool, cut: bool, s: AgainSettings) -> bool:
-    """Whether a place of the object is rather believed than the doubted mask. `follows`: the mask before was replaced;
-    `cut`: the doubted one is a part only, which looks like the object as its whole does."""
+def _better(new: Judged, old: Judged, usual: float, wrong: bool, cut: bool, s: AgainSettings) -> bool:
+    """Whether a place of the object is rather believed than the doubted mask. `wrong`: the mask before was replaced, or
+    this one is far too large; `cut`: it is a part only, which looks like the object as its whole does."""
     if cut and old.mask.any() and (new.mask & old.mask).sum() > (1 - s.cut / 2) * old.mask.sum():
         return bool(new.support >= s.doubted * usual and new.mask.sum() > old.mask.sum())
-    return new.support >= max(s.found * usual, old.support + (-s.better if follows else s.better))
+    return new.support >= max(s.found * usual, old.support + (-s.better if wrong else s.better))
 
 
 def _followed(

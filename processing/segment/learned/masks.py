@@ -28,7 +28,7 @@ from processing.segment.background.foreground import (
 )
 from processing.segment.background.static_scene import StaticScene, leveled
 from processing.segment.learned.again import AgainSettings, Judged, support_of
-from processing.segment.learned.network import NetworkSettings, PixelNetwork
+from processing.segment.learned.network import NetworkSettings, PixelNetwork, log_share
 from processing.segment.learned.pixels import pixel_features
 from recordings.records import RgbdFrame
 
@@ -80,14 +80,14 @@ def half_of(toss: int, position: int, s: LearnedSettings) -> int:
 
 
 def sizes_px(areas_px: Sequence[int], s: LearnedSettings) -> Float[Array, " n"]:
-    """How large the object is in each frame: a mask that was cut off is smaller than those around it."""
+    """How large the object is in each frame, as the frames around have it: one mask may be cut off, or hold more."""
     own = np.sqrt(np.asarray(areas_px, dtype=np.float64))
     large = own**2 >= s.least_px
     sizes = own.copy()
     for i in range(len(own)):
         around = slice(max(i - s.size_frames, 0), i + s.size_frames + 1)
         seen = own[around][large[around]]
-        sizes[i] = max(own[i], float(np.median(seen))) if len(seen) else own[i]
+        sizes[i] = float(np.median(seen)) if len(seen) else own[i]
     return sizes
 
 
@@ -149,15 +149,19 @@ specks."""
 
 
 def redrawn(
-    seen: Look, network: PixelNetwork, shape: tuple[int, ...], background: BackgroundSettings, s: LearnedSettings
-) -> Judged:
-    """The mask anew in an image of that shape, of what is connected with the old one."""
+    seen: Look, network: PixelNetwork, shape: tuple[int, ...], background: BackgroundSettings, s: LearnedSettings,
+    rough: bool = False,
+) -> Judged:  # fmt: skip
+    """The mask anew in an image of that shape, of what is connected with the old one. `rough`: that says where to look,
+    and nothing of its pixels."""
     inside = cv2.distanceTransform(seen.mask.astype(np.uint8), cv2.DIST_L2, 5)
     outside = cv2.distanceTransform((~seen.mask).astype(np.uint8), cv2.DIST_L2, 5)
-    share = 1.0 / ((1 + 2 * s.reach) ** 2 - 1)  # the object's against all else in the window
     looks = network.log_odds(seen.features)
-    odds = np.clip(looks + np.log(share), -s.most_odds, s.most_odds)
-    odds = odds + np.where(seen.mask, s.mask_odds + s.deeper * np.minimum(inside, s.deepest_px), -s.mask_odds)
+    if rough:  # as much of the window is the object's
+        odds = np.clip(looks + np.log(seen.mask.mean() / (1 - seen.mask.mean())), -s.most_odds, s.most_odds)
+    else:
+        odds = np.clip(looks + log_share(seen.mask, outside, s.network), -s.most_odds, s.most_odds)
+        odds = odds + np.where(seen.mask, s.mask_odds + s.deeper * np.minimum(inside, s.deepest_px), -s.mask_odds)
     odds = odds - s.beyond * np.maximum(outside - s.border_px, 0.0) / seen.size_px
     odds = np.where(seen.others, -8.0, odds).astype(np.float32)
     belief = smooth(odds, seen.color, background.foreground)

@@ -41,7 +41,7 @@ class PixelNetwork:
     biases: tuple[Float32[Array, " _"], ...]
 
     def log_odds(self, features: Float32[Array, "a b f"]) -> Float32[Array, "a b"]:
-        """Of the object against all else, where both are equally frequent."""
+        """Of the object against all else, where they are as frequent as in the samples learned from (`log_share`)."""
         x = (features.reshape(-1, features.shape[-1]) - self.mean) / self.spread
         for k, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
             x = x @ weight.T + bias
@@ -84,6 +84,13 @@ def samples_of(
             rows.append(features.reshape(-1, features.shape[-1])[chosen])
             labels.append(np.full(wanted, label))
     return np.concatenate(rows), np.concatenate(labels)
+
+
+def log_share(mask: Bool[Array, "a b"], outside_px: Float32[Array, "a b"], s: NetworkSettings) -> float:
+    """To be added to the network's log-odds near a mask's border: `samples_of` takes pixels of the object, and of all
+    else, not as often as there are of them."""
+    near, anywhere = ((outside_px > 0) & (outside_px < s.near_px)).sum(), (outside_px > 0).sum()
+    return float(np.log(max(mask.sum(), 1) * (0.5 / max(near, 1) + 0.5 / max(anywhere, 1))))
 
 
 def learned(features: Float32[Array, "n f"], labels: Bool[Array, " n"], s: NetworkSettings) -> PixelNetwork:
