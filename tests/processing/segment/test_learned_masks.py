@@ -2,16 +2,30 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+from typing import Any
+
+import cv2
 import numpy as np
 import pytest
 
+from processing.config import Config
+from processing.pipeline.masks import all_masks, masks_anew
+from processing.pipeline.start import start_run
 from processing.segment.background.follow import BackgroundSettings
 from processing.segment.background.foreground import grown
 from processing.segment.background.static_scene import StaticScene
 from processing.segment.learned.again import AgainSettings, Judged, found_again, overlap, support_of
 from processing.segment.learned.masks import LearnedSettings, Look, look, redrawn, sizes_px
 from processing.segment.learned.network import NetworkSettings, PixelNetwork, learned, samples_of
+from processing.stages.find import find_object
+from processing.stages.recording.rig import refine_rig
+from processing.stages.recording.scene import learn_static_scene
+from processing.variants import TRACKERS
+from recordings.progress import Silent
 from recordings.records import RgbdFrame
+from recordings.results.folder import read_masks
+from recordings.session import Session
 
 SIZE = (120, 160)
 TABLE_M, BODY_M, ARM_M = 0.80, 0.79, 0.65
@@ -189,3 +203,28 @@ def test_given_masks_and_those_that_look_right_stay() -> None:
     truth, seen = moving(set(), {6})
     found = again(truth, seen, [k == 6 for k in range(12)])
     assert all(j.mask is m for j, m in zip(found, seen, strict=True))
+
+
+def test_masks_of_a_session_that_were_cut_are_made_whole_and_given_ones_stay(
+    tiny_world: Any, record_tiny: Any, tmp_path: Path
+) -> None:
+    session = Session.open(record_tiny())
+    run = start_run(session, session.tosses, tmp_path / "out", Config(), TRACKERS[0], lambda _: Silent())
+    scene = learn_static_scene(run)
+    rig = refine_rig(run, scene)
+    masks = all_masks(run, scene, rig, find_object(run, scene, rig))
+    followed = {t: list(read_masks(masks[t].folder, t)) for t in run.tosses}
+    for i in (2, 5):  # a step of following that lost the lower half of the object
+        cut = followed[0][i].copy()
+        cut[int(np.nonzero(cut)[0].mean()) :] = False
+        assert cv2.imwrite(str(masks[0].folder / "toss_00.masks" / f"{i:06d}.png"), cut.astype(np.uint8) * 255)
+    anew = masks_anew(run, scene, masks)
+    assert {done.name.rsplit("-", 1)[0] for done in anew.values()} == {"learned-masks"}
+    found = read_masks(anew[0].folder, 0)
+    given = session.toss(0).masks()
+    assert given
+    for i, mask in given.items():
+        np.testing.assert_array_equal(found[i], mask)
+    assert min(overlap(np.asarray(found[i]), followed[0][i]) for i in range(len(found))) > 0.85
+    again = masks_anew(run, scene, masks)
+    assert all(again[t].reused and again[t].key == anew[t].key for t in anew)
