@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from processing.backends import SEGMENTERS
 from processing.run import Run, each
 from processing.stages.learn_pixels import learn_pixels
 from processing.stages.learned_masks import learned_masks
@@ -18,7 +19,9 @@ def all_masks(run: Run, scene: Done, rig: Done, found: Done | None) -> dict[int,
 
 def masks_anew(run: Run, scene: Done, masks: Mapping[int, Done]) -> dict[int, Done]:
     """Drawn anew, but where all of a toss's were given or none was found; as they are where few frames show enough to
-    learn from."""
+    learn from, and where the user chose a segmenter that has learned what objects are."""
+    if run.config.backends.segmenter != SEGMENTERS[0]:
+        return dict(masks)
     uncertain = {t: done for t, done in masks.items() if done.result.given < done.result.frames - done.result.empty}
     pixels = learn_pixels(run, scene, uncertain) if uncertain else None
     if pixels is None or not pixels.result.usable:

@@ -158,7 +158,8 @@ def redrawn(
     outside = cv2.distanceTransform((~seen.mask).astype(np.uint8), cv2.DIST_L2, 5)
     looks = network.log_odds(seen.features)
     if rough:  # as much of the window is the object's
-        odds = np.clip(looks + np.log(seen.mask.mean() / (1 - seen.mask.mean())), -s.most_odds, s.most_odds)
+        share = float(seen.mask.sum() + 1) / float((~seen.mask).sum() + 1)
+        odds = np.clip(looks + np.log(share), -s.most_odds, s.most_odds)
     else:
         odds = np.clip(looks + log_share(seen.mask, outside, s.network), -s.most_odds, s.most_odds)
         odds = odds + np.where(seen.mask, s.mask_odds + s.deeper * np.minimum(inside, s.deepest_px), -s.mask_odds)
