@@ -56,6 +56,8 @@ class LearnedSettings:
     beyond: float = 6.0
     """... and outside of it for every size of the object beyond `border_px`."""
     border_px: float = 2.0
+    least_piece: float = 0.1
+    """A piece smaller than this share of the largest one is a speck: of a finger, more often than of the object."""
     blocks: int = 6
     """So many frames in a row go to the same half: what is learned of one half judges the other."""
     most_frames: int = 240
@@ -167,9 +169,9 @@ def redrawn(
     odds = np.where(seen.others, -8.0, odds).astype(np.float32)
     belief = smooth(odds, seen.color, background.foreground)
     _, labels, areas, _ = cv2.connectedComponentsWithStats((belief > 0).astype(np.uint8), connectivity=4)
-    kept = areas[:, cv2.CC_STAT_AREA] >= SPECK_PX
-    kept &= np.bincount(labels[seen.mask], minlength=len(kept)) > 0
-    kept[0] = False
+    sizes = areas[:, cv2.CC_STAT_AREA] * (np.bincount(labels[seen.mask], minlength=len(areas)) > 0)
+    sizes[0] = 0
+    kept = sizes >= max(SPECK_PX, int(np.ceil(s.least_piece * sizes.max())))
     part = fill_holes(kept[labels]) if kept.any() else seen.mask
     border = grown(part, 2) & ~(cv2.erode(part.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0)
     mask = np.zeros(shape[:2], dtype=bool)

@@ -130,6 +130,16 @@ def test_a_hand_of_the_objects_color_that_was_left_out_stays_out(scene: StaticSc
     assert overlap(found.mask, body) > 0.9
 
 
+def test_a_half_behind_a_finger_stays_and_a_speck_does_not(scene: StaticScene, network: PixelNetwork) -> None:
+    body, finger, speck = box(60, 50), box(76, 46, 6, 32), box(60, 84, 8, 6)
+    halves = body & ~finger
+    seen = looked(picture(scene, halves | speck, 82, finger), scene, halves | speck)
+    found = redrawn(seen, network, SIZE, BACKGROUND, SETTINGS).mask
+    assert not found[speck].any()
+    assert found[halves & box(60, 50, 14)].mean() > 0.9
+    assert found[halves & box(84, 50, 12)].mean() > 0.9
+
+
 def test_the_robots_pixels_stay_out(scene: StaticScene, network: PixelNetwork) -> None:
     body = box(60, 50)
     robot = box(78, 50, 18)
