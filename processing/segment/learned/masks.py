@@ -16,13 +16,12 @@ from numpy import ndarray as Array
 
 from processing.segment.background.follow import BackgroundSettings
 from processing.segment.background.foreground import (
-    ForegroundSettings,
     Window,
     cut,
     fill_holes,
     grown,
     nearer_than_scene,
-    shadow_distance,
+    scene_colored,
     smooth,
     window_around,
 )
@@ -120,23 +119,17 @@ def look(
         return None
     color, depth_m, part = frame.color_rgb[at].astype(np.float32), frame.depth_m[at], cut(scene, at)
     features = pixel_features(color, depth_m, part, background.foreground)
-    others = _others(color, depth_m, part, mask[at], background.foreground)
+    strange = part.known & ~scene_colored(frame, scene, at, background.foreground)
+    others = _others(strange | nearer_than_scene(depth_m, part, background.foreground), mask[at])
     if robot is not None:
         others |= robot[at] & ~mask[at]
     return Look(at, mask[at], size_px, color, features, others)
 
 
-def _others(
-    color: Float32[Array, "a b 3"],
-    depth_m: Float32[Array, "a b"],
-    scene: StaticScene,
-    mask: Bool[Array, "a b"],
-    s: ForegroundSettings,
-) -> Bool[Array, "a b"]:
+def _others(strange: Bool[Array, "a b"], mask: Bool[Array, "a b"]) -> Bool[Array, "a b"]:
     """What is no scene in any shade, lies beside the mask, and reaches out of the window, as hands and arms do: whoever
     followed the object has seen it and left it out."""
-    strange = shadow_distance(color, scene.color_rgb, s.lit) > s.color_step + 3 * scene.color_sigma
-    found = (nearer_than_scene(depth_m, scene, s) | (strange & scene.known)) & ~grown(mask, 2)
+    found = strange & ~grown(mask, 2)
     opened = cv2.morphologyEx(found.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     count, labels, areas, _ = cv2.connectedComponentsWithStats(opened, connectivity=4)
     edge = np.concatenate([labels[:2].ravel(), labels[-2:].ravel(), labels[:, :2].ravel(), labels[:, -2:].ravel()])
@@ -172,7 +165,7 @@ def redrawn(
     sizes = areas[:, cv2.CC_STAT_AREA] * (np.bincount(labels[seen.mask], minlength=len(areas)) > 0)
     sizes[0] = 0
     kept = sizes >= max(SPECK_PX, int(np.ceil(s.least_piece * sizes.max())))
-    part = fill_holes(kept[labels]) if kept.any() else seen.mask
+    part = fill_holes(kept[labels]) & ~seen.others if kept.any() else seen.mask
     border = grown(part, 2) & ~(cv2.erode(part.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0)
     mask = np.zeros(shape[:2], dtype=bool)
     mask[seen.at] = part
