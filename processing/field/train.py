@@ -13,8 +13,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import torch
 from torch import Tensor
-from torch.optim.adam import adam
 
+from processing.engine.adam import Adam
 from processing.engine.parts import side_by_side
 from processing.field.fuse import FuseConfig, Grid, fuse
 from processing.field.network import ObjectField
@@ -110,7 +110,7 @@ def _optimise(
 ) -> tuple[float, ...]:
     networks = [model.features, *model.geometry.parameters(), *model.appearance.parameters()]
     warm = [model.warm_distance, model.warm_color]
-    groups = [Moments(networks, config.learning_rate), Moments(warm, config.warm_learning_rate)]
+    groups = [Adam(networks, config.learning_rate), Adam(warm, config.warm_learning_rate)]
     decay, losses = 0.1 ** (1 / max(config.steps, 1)), []
     for step in range(config.steps):
         loss = _with_gradients(halves_of_loss(model, poses, dataset, config), [*networks, *warm])
@@ -133,28 +133,6 @@ def _with_gradients(halves: Sequence[Callable[[], Tensor]], parameters: Sequence
     for parameter, a, b in zip(parameters, gradients, more, strict=True):
         parameter.grad = b if a is None else a if b is None else a.add_(b)
     return one + other
-
-
-class Moments:
-    """Parameters, their learning rate and what Adam keeps of them (Kingma and Ba 2015; betas .9 and .99).
-
-    torch.optim.Adam would do the same steps, but importing torch._dynamo for it costs each process two CPU seconds.
-    """
-
-    def __init__(self, parameters: Sequence[Tensor], learning_rate: float) -> None:
-        self._parameters, self._rate = list(parameters), learning_rate
-        self._mean, self._square = ([torch.zeros_like(p) for p in self._parameters] for _ in range(2))
-        self._steps = [torch.zeros((), device=p.device) for p in self._parameters]
-
-    @torch.no_grad()
-    def step(self, decay: float) -> None:
-        """One step along the gradients, which are used up; the learning rate decays by this factor."""
-        gradients = [p.grad if p.grad is not None else torch.zeros_like(p) for p in self._parameters]
-        adam(self._parameters, gradients, self._mean, self._square, [], self._steps, fused=True, amsgrad=False,
-             beta1=0.9, beta2=0.99, lr=self._rate, weight_decay=0.0, eps=1e-8, maximize=False)  # fmt: skip
-        self._rate *= decay
-        for parameter in self._parameters:
-            parameter.grad = None
 
 
 Poses = tuple[Tensor, Tensor]

@@ -19,7 +19,7 @@ from processing.stages.segment import SegmentResult
 from processing.store import Done, plain
 from recordings.results.folder import RobotMasks, read_masks
 
-VERSION = 1
+VERSION = 2
 HALVES = (0, 1)
 FEWEST = 4
 """A half with fewer frames teaches nothing: then masks stay as they are."""

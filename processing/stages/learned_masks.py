@@ -21,7 +21,7 @@ from processing.store import Done
 from recordings.results.folder import write_masks
 from recordings.results.stage_files import read_arrays
 
-VERSION = 1
+VERSION = 2
 
 
 def learned_masks(

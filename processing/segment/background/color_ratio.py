@@ -14,6 +14,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32
 from numpy import ndarray as Array
 
+from processing.segment.background.channels import sum_of_channels
+
 Sum = Callable[[Array], Array]
 Image = Float32[Array, "a b"]
 ANY_COLOR = 256.0**-3
@@ -57,9 +59,9 @@ class _Shades:
 
     @staticmethod
     def of(color: Float32[Array, "a b 3"], scene_rgb: Float32[Array, "a b 3"]) -> _Shades:
-        size2 = np.maximum((scene_rgb**2).sum(-1), 1.0)
-        shade = (color * scene_rgb).sum(-1) / size2
-        return _Shades(shade, ((color - shade[..., None] * scene_rgb) ** 2).sum(-1), size2)
+        size2 = np.maximum(sum_of_channels(scene_rgb**2), 1.0)
+        shade = sum_of_channels(color * scene_rgb) / size2
+        return _Shades(shade, sum_of_channels((color - shade[..., None] * scene_rgb) ** 2), size2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +102,7 @@ def _log_ratio(
 ) -> Image:  # fmt: skip
     mean, spread = color[own].mean(0), np.cov(color[own].T).astype(np.float32)
     local_mean, local_spread = _object_nearby(color - mean, own, spread, nearby, s)
-    mixed2 = s.mixed**2 * ((local_mean + mean - scene.shade[..., None] * scene_rgb) ** 2).sum(-1)
+    mixed2 = s.mixed**2 * sum_of_channels((local_mean + mean - scene.shade[..., None] * scene_rgb) ** 2)
     alike, noise2 = np.eye(3, dtype=np.float32), s.noise**2
     like_nearby = _normal(color - mean - local_mean, local_spread + (noise2 + mixed2)[..., None, None] * alike)
     like_any = _normal(color - mean, spread + noise2 * alike)

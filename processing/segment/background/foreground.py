@@ -9,8 +9,9 @@ import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 from numpy import ndarray as Array
 
+from processing.segment.background.channels import most_of_channels, sum_of_channels
 from processing.segment.background.color_ratio import ColorSettings, color_log_ratio
-from processing.segment.background.static_scene import StaticScene, most_of_channels
+from processing.segment.background.static_scene import StaticScene
 from processing.sensor.noise import stereo_sigma_m
 from recordings.geometry import CameraModel
 from recordings.records import RgbdFrame
@@ -100,8 +101,12 @@ def moved_pixels(frame: RgbdFrame, scene: StaticScene, s: ForegroundSettings) ->
 
 def shadow_distance(color: Float32[Array, "*n 3"], scene: Float32[Array, "*n 3"], lit: float) -> Float32[Array, "*n"]:
     """Distance of a colour from the scene's colour in any shade between black and `lit` times as bright."""
-    shade = (color * scene).sum(-1) / np.maximum((scene * scene).sum(-1), 1.0)
-    return np.linalg.norm(color - np.clip(shade, 0.0, lit)[..., None] * scene, axis=-1).astype(np.float32)
+    shade = sum_of_channels(color * scene) / np.maximum(sum_of_channels(scene * scene), 1.0)
+    return _length(color - np.clip(shade, 0.0, lit)[..., None] * scene)
+
+
+def _length(color: Float32[Array, "*n c"]) -> Float32[Array, "*n"]:
+    return np.asarray(np.sqrt(sum_of_channels(color**2)), dtype=np.float32)
 
 
 def scene_colored(frame: RgbdFrame, scene: StaticScene, at: Window, s: ForegroundSettings) -> Bool[Array, "a b"]:
@@ -134,7 +139,7 @@ def pixel_log_odds(
     ring = (cv2.dilate(band.astype(np.uint8), kernel(s.ring_px)) > 0) & ~band & scenic
     around_px = 4 * s.band_inside_px + 1
     by_color = color_log_ratio(color, part.color_rgb, part.color_sigma, core, ring, around_px, s.color) * part.known
-    like_scene = part.known & (np.linalg.norm(color - part.color_rgb, axis=-1) <= noise)
+    like_scene = part.known & (_length(color - part.color_rgb) <= noise)
     total = by_color + _depth_votes(depth, nearer, part, core, band & ~core, like_scene, s)
     if likeness is not None:
         total = total + s.weight_likeness * likeness
@@ -182,7 +187,7 @@ def smooth(
     to 1 (object)."""
     pulls = []
     for dy, dx in ((0, 1), (1, 0), (1, 1), (1, -1)):
-        step = np.linalg.norm(color - np.roll(color, (-dy, -dx), (0, 1)), axis=-1)
+        step = _length(color - np.roll(color, (-dy, -dx), (0, 1)))
         pull = np.exp(-((step / s.edge_color) ** 2) / 2) / (1.0 if dy * dx == 0 else 1.4) + 0.1
         pulls.append((dy, dx, pull.astype(np.float32)))
     belief = np.tanh(log_odds / 2)

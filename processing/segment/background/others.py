@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32
 from numpy import ndarray as Array
 
+from processing.segment.background.channels import most_of_channels
 from processing.segment.background.foreground import (
     ForegroundSettings,
     grown,
@@ -17,7 +18,7 @@ from processing.segment.background.foreground import (
     window_around,
 )
 from processing.segment.background.placement import best_shift, shifted
-from processing.segment.background.static_scene import StaticScene, most_of_channels
+from processing.segment.background.static_scene import StaticScene
 from recordings.records import RgbdFrame
 
 PLACE_PX = 5.0

@@ -13,6 +13,7 @@ from numpy import ndarray as Array
 
 from processing.engine.parts import in_parts
 from processing.segment.background.moving_camera import refuse_moving_camera
+from processing.segment.background.channels import most_of_channels
 from processing.sensor.noise import stereo_sigma_m
 from recordings.constants import MAD_TO_SIGMA_SHORT
 from recordings.errors import BadInput
@@ -363,11 +364,6 @@ def exposure_gain(frame: RgbdFrame, scene: StaticScene) -> tuple[float, float]:
     seen, usual = color[level][usable].astype(np.float32), base[level][usable]
     ratio = seen @ np.ones(3, np.float32) / np.maximum(usual @ np.ones(3, np.float32), 1.0)
     return float(np.median(ratio)), float(clipped.mean())
-
-
-def most_of_channels(color: Array) -> Array:
-    """The most of the three channels; much faster than .max(-1)."""
-    return np.asarray(np.maximum(np.maximum(color[..., 0], color[..., 1]), color[..., 2]))
 
 
 def leveled(

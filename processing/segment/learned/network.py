@@ -42,10 +42,12 @@ class PixelNetwork:
 
     def log_odds(self, features: Float32[Array, "a b f"]) -> Float32[Array, "a b"]:
         """Of the object against all else, where they are as frequent as in the samples learned from (`log_share`)."""
-        x = (features.reshape(-1, features.shape[-1]) - self.mean) / self.spread
-        for k, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
-            x = x @ weight.T + bias
-            x = np.maximum(x, 0.0) if k < len(self.weights) - 1 else x
+        first = self.weights[0] / self.spread
+        x = features.reshape(-1, features.shape[-1]) @ first.T
+        x += self.biases[0] - first @ self.mean
+        for weight, bias in zip(self.weights[1:], self.biases[1:], strict=True):
+            x = np.maximum(x, 0.0, out=x) @ weight.T
+            x += bias
         return np.asarray(x[:, 0].reshape(features.shape[:2]), dtype=np.float32)
 
     def arrays(self, name: str) -> dict[str, Float32[Array, "..."]]:
@@ -97,6 +99,8 @@ def learned(features: Float32[Array, "n f"], labels: Bool[Array, " n"], s: Netwo
     """The network that tells these pixels apart, whatever few wrong labels say."""
     import torch
 
+    from processing.engine.adam import Adam
+
     mean, spread = features.mean(0), features.std(0) + 1e-2
     rows, wanted = torch.from_numpy((features - mean) / spread), torch.from_numpy(labels)
     random = torch.Generator().manual_seed(0)
@@ -108,7 +112,7 @@ def learned(features: Float32[Array, "n f"], labels: Bool[Array, " n"], s: Netwo
             layer.weight.uniform_(-reach, reach, generator=random)
             layer.bias.uniform_(-reach, reach, generator=random)
     parameters = [p for layer in layers for p in layer.parameters()]
-    optimizer = torch.optim.Adam(parameters, s.rate, weight_decay=s.decay)
+    optimizer = Adam(parameters, s.rate, s.decay)
     for _ in range(s.steps):
         chosen = torch.randint(len(rows), (s.batch,), generator=random)
         x = rows[chosen]
@@ -117,7 +121,6 @@ def learned(features: Float32[Array, "n f"], labels: Bool[Array, " n"], s: Netwo
         odds = layers[-1](x)[:, 0]
         right = torch.sigmoid(torch.where(wanted[chosen], odds, -odds)).clamp(min=1e-4)
         loss = ((1 - right**s.robust) / s.robust).mean()
-        optimizer.zero_grad()
         loss.backward()
         optimizer.step()
     weights = tuple(layer.weight.detach().numpy() for layer in layers)

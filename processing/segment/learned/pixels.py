@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float32
 from numpy import ndarray as Array
 
+from processing.segment.background.channels import sum_of_channels
 from processing.segment.background.foreground import ForegroundSettings, kernel
 from processing.segment.background.static_scene import StaticScene
 from processing.sensor.noise import stereo_sigma_m
@@ -29,12 +30,12 @@ def pixel_features(
     nearer side's depth, as far as its windows reach.
     """
     found = [part for blur in BLURS_PX for part in _colors(color, scene.color_rgb, blur)]
-    gray = color.mean(-1)
+    gray = sum_of_channels(color) / np.float32(3)
     mean = cv2.GaussianBlur(gray, (0, 0), BLURS_PX[1])
     spread = np.maximum(cv2.GaussianBlur(gray**2, (0, 0), BLURS_PX[1]) - mean**2, 1.0)
     solid = cv2.erode(_before(depth_m, scene), kernel(s.band_inside_px))
     single = (np.log(spread + 4.0) / 3 - 1, scene.known, solid, scene.depth_m > 0)
-    return np.concatenate([*found, *(x[..., None] for x in single)], axis=-1).astype(np.float32)
+    return np.concatenate([*found, *(x[..., None] for x in single)], axis=-1, dtype=np.float32)
 
 
 def _colors(
@@ -42,7 +43,7 @@ def _colors(
 ) -> list[Float32[Array, "a b c"]]:
     seen = cv2.GaussianBlur(color, (0, 0), blur_px)
     before = scene_rgb if blur_px < 1 else cv2.GaussianBlur(scene_rgb, (0, 0), blur_px)
-    share, share_before = (x[..., :2] / (x.sum(-1, keepdims=True) + 1.5 * DARK) for x in (seen, before))
+    share, share_before = (x[..., :2] / (sum_of_channels(x)[..., None] + 1.5 * DARK) for x in (seen, before))
     bright = np.log(seen + DARK)
     return [bright - 4.5, 2 * (bright - np.log(before + DARK)), 6 * (share - 1 / 3), 10 * (share - share_before)]
 
