@@ -22,7 +22,7 @@ from processing.store import Done
 from recordings.geometry import Transform
 from recordings.robot.arm import PANDA_TOOL
 
-VERSION = 3
+VERSION = 4
 HALF_STEP_NS = 5_000_000
 
 
@@ -105,7 +105,9 @@ def _finite(value: float) -> float | None:
 def _table_counts(table: TableScale | None) -> dict[str, Any] | str:
     if table is None:
         return "the table is not seen, or its place is not calibrated"
-    return {"scale": round(table.scale, 5), "sigma": round(table.sigma, 5), "tilt_deg": round(float(table.tilt_deg), 3)}
+    turned = {"table": round(table.turned_at_table, 5), "camera": round(table.turned_at_camera, 5)}
+    return {"scale": round(table.scale, 5), "sigma": round(table.sigma, 5), "tilt_deg": round(table.tilt_deg, 3),
+            "turned_at": turned}  # fmt: skip
 
 
 def _robot_counts(fit: RobotFit | None, calibrated: Transform | None) -> dict[str, Any] | str:

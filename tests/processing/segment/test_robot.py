@@ -221,13 +221,12 @@ def test_the_hand_is_known_while_the_fingers_stay_as_they_were(view: RobotView) 
     np.testing.assert_allclose(hand[1], (root @ path.links(310_000_000)[PANDA_TOOL]).matrix)
 
 
-def table_scene(tiny_world: Any, factor: float, tilt_deg: float = 0.0) -> tuple[StaticScene, Transform]:
+def table_scene(tiny_world: Any, factor: float) -> tuple[StaticScene, Transform]:
     table = calibrated_table_depth(tiny_world.calibration, "d455")
     true = tiny_world.world_from_camera
-    turned = Transform("world", "world", rotation_exp(np.array([np.deg2rad(tilt_deg), 0, 0])), np.zeros(3))
     ones = np.ones(table.shape, bool)
     depth = (table * np.float32(factor)).astype(np.float32)
-    return StaticScene(depth, 0 * depth, np.zeros((*depth.shape, 3), np.float32), 0 * depth, ones, table), turned @ true
+    return StaticScene(depth, 0 * depth, np.zeros((*depth.shape, 3), np.float32), 0 * depth, ones, table), true
 
 
 def test_the_table_tells_the_depth_scale(tiny_world: Any) -> None:
@@ -235,15 +234,39 @@ def test_the_table_tells_the_depth_scale(tiny_world: Any) -> None:
     found = table_scale(scene, tiny_world.camera, world_from_camera, DepthScaleSettings())
     assert found is not None
     assert found.scale == pytest.approx(1.01, abs=3e-4)
-    assert posterior_scale(found.scale, found.sigma, DepthScaleSettings()) == pytest.approx(1.01, abs=4e-4)
+    assert found.turned_at_camera == pytest.approx(found.turned_at_table, abs=3e-4)
+    sure = DepthScaleSettings(place_m=0.0)
+    told = table_scale(scene, tiny_world.camera, world_from_camera, sure)
+    assert told is not None
+    assert posterior_scale(told.scale, told.sigma, sure) == pytest.approx(1.01, abs=4e-4)
 
 
-def test_a_tilted_table_is_the_calibrations_error_and_its_scale_counts_less(tiny_world: Any) -> None:
-    scene, world_from_camera = table_scene(tiny_world, 1.004, tilt_deg=0.3)
-    found = table_scale(scene, tiny_world.camera, world_from_camera, DepthScaleSettings())
+@pytest.mark.parametrize("pivot", ["table", "camera"])
+def test_a_tilted_table_is_the_calibrations_error_and_its_scale_counts_less(tiny_world: Any, pivot: str) -> None:
+    """A calibration that is turned about a point of the table keeps the distance there; one that is turned about the
+    camera keeps the camera's height. The scale is halfway, and as unsure as they are apart."""
+    scene, true = table_scene(tiny_world, 1.004)
+    turn = rotation_exp(np.array([np.deg2rad(0.3), 0, 0]))
+    keeps = np.zeros(3) if pivot == "camera" else middle_of_table(scene, tiny_world, true) - true.translation_m
+    at = true.translation_m + keeps - turn @ keeps
+    calibrated = Transform("world", "d455", turn @ true.rotation, at)
+    found = table_scale(scene, tiny_world.camera, calibrated, DepthScaleSettings())
     assert found is not None
     assert found.tilt_deg == pytest.approx(0.3, abs=0.02)
-    assert 0.7 < found.sigma / np.deg2rad(0.3) < 2.0  # as far off as the table is high, or somewhat more
+    right, other = found.turned_at_table, found.turned_at_camera
+    right, other = (right, other) if pivot == "table" else (other, right)
+    assert right == pytest.approx(1.004, abs=4e-4)
+    assert abs(other - 1.004) > 5 * abs(right - 1.004)
+    assert found.scale == pytest.approx((right + other) / 2)
+    assert abs(found.scale - 1.004) < 1.2 * found.sigma
+
+
+def middle_of_table(scene: StaticScene, tiny_world: Any, world_from_camera: Transform) -> np.ndarray:
+    """Of what the camera sees of it (world)."""
+    points = tiny_world.camera.pixel_rays() * scene.table_depth_m[..., None]
+    seen = np.median(points[scene.table_depth_m > 0], axis=0)
+    middle = world_from_camera.rotation @ seen + world_from_camera.translation_m
+    return np.array([middle[0], middle[1], 0.0])
 
 
 def test_the_scale_is_the_posteriors_mean() -> None:
