@@ -190,7 +190,7 @@ def smooth(
         step = _length(color - np.roll(color, (-dy, -dx), (0, 1)))
         pull = np.exp(-((step / s.edge_color) ** 2) / 2) / (1.0 if dy * dx == 0 else 1.4) + 0.1
         pulls.append((dy, dx, pull.astype(np.float32)))
-    belief = np.tanh(log_odds / 2)
+    belief: Float32[Array, "h w"] = np.tanh(log_odds / 2)
     for _ in range(s.sweeps):
         around = np.zeros_like(belief)
         for dy, dx, pull in pulls:
