@@ -190,9 +190,9 @@ def smooth(
         step = _length(color - np.roll(color, (-dy, -dx), (0, 1)))
         pull = np.exp(-((step / s.edge_color) ** 2) / 2) / (1.0 if dy * dx == 0 else 1.4) + 0.1
         pulls.append((dy, dx, pull.astype(np.float32)))
-    belief: Float32[Array, "h w"] = np.tanh(log_odds / 2)
+    belief = np.tanh(log_odds / 2)
     for _ in range(s.sweeps):
-        around = np.zeros_like(belief)
+        around: Array = np.zeros_like(belief)
         for dy, dx, pull in pulls:
             around += pull * np.roll(belief, (-dy, -dx), (0, 1)) + np.roll(pull * belief, (dy, dx), (0, 1))
         belief = np.tanh((log_odds + s.smoothing * around) / 2)
