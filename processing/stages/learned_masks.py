@@ -21,7 +21,7 @@ from processing.store import Done
 from recordings.results.folder import write_masks
 from recordings.results.stage_files import read_arrays
 
-VERSION = 2
+VERSION = 3
 
 
 def learned_masks(

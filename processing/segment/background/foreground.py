@@ -185,14 +185,14 @@ def smooth(
 ) -> Float32[Array, "h w"]:
     """Mean field of an Ising model whose neighbours pull less across edges of colour (of all its channels): -1 (scene)
     to 1 (object)."""
-    pulls = []
+    pulls: list[tuple[int, int, Array]] = []
     for dy, dx in ((0, 1), (1, 0), (1, 1), (1, -1)):
         step = _length(color - np.roll(color, (-dy, -dx), (0, 1)))
         pull = np.exp(-((step / s.edge_color) ** 2) / 2) / (1.0 if dy * dx == 0 else 1.4) + 0.1
         pulls.append((dy, dx, pull.astype(np.float32)))
     belief = np.tanh(log_odds / 2)
     for _ in range(s.sweeps):
-        around: Array = np.zeros_like(belief)
+        around = np.zeros_like(belief)
         for dy, dx, pull in pulls:
             around += pull * np.roll(belief, (-dy, -dx), (0, 1)) + np.roll(pull * belief, (dy, dx), (0, 1))
         belief = np.tanh((log_odds + s.smoothing * around) / 2)

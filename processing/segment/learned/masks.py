@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Bool, Float, Float32, Int32
 from numpy import ndarray as Array
 
 from processing.segment.background.follow import BackgroundSettings
@@ -56,7 +56,9 @@ class LearnedSettings:
     """... and outside of it for every size of the object beyond `border_px`."""
     border_px: float = 2.0
     least_piece: float = 0.1
-    """A piece smaller than this share of the largest one is a speck: of a finger, more often than of the object."""
+    """A piece smaller than this share of the largest one is a speck (of a finger, more often than of the object), ..."""
+    least_alike: float = 0.5
+    """... unless its log-odds are this share of the largest one's: a corner behind a finger looks like the object."""
     blocks: int = 6
     """So many frames in a row go to the same half: what is learned of one half judges the other."""
     most_frames: int = 240
@@ -161,13 +163,23 @@ def redrawn(
     odds = odds - s.beyond * np.maximum(outside - s.border_px, 0.0) / seen.size_px
     odds = np.where(seen.others, -8.0, odds).astype(np.float32)
     belief = smooth(odds, seen.color, background.foreground)
-    _, labels, areas, _ = cv2.connectedComponentsWithStats((belief > 0).astype(np.uint8), connectivity=4)
-    sizes = areas[:, cv2.CC_STAT_AREA] * (np.bincount(labels[seen.mask], minlength=len(areas)) > 0)
-    sizes[0] = 0
-    kept = sizes >= max(SPECK_PX, int(np.ceil(s.least_piece * sizes.max())))
+    kept, labels = _pieces(belief > 0, looks, seen.mask, s)
     part = fill_holes(kept[labels]) & ~seen.others if kept.any() else seen.mask
     border = grown(part, 2) & ~(cv2.erode(part.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0)
     mask = np.zeros(shape[:2], dtype=bool)
     mask[seen.at] = part
     sure = float(np.abs(belief[border]).mean()) if kept.any() and border.any() else 0.0
     return Judged(mask, sure, support_of(looks, seen.mask))
+
+
+def _pieces(
+    found: Bool[Array, "a b"], looks: Float32[Array, "a b"], mask: Bool[Array, "a b"], s: LearnedSettings
+) -> tuple[Bool[Array, " n"], Int32[Array, "a b"]]:
+    """Which pieces of what was found are the object's, and the piece of every pixel (0: none)."""
+    count, labels, areas, _ = cv2.connectedComponentsWithStats(found.astype(np.uint8), connectivity=4)
+    sizes = areas[:, cv2.CC_STAT_AREA] * (np.bincount(labels[mask], minlength=count) > 0)
+    sizes[0] = 0
+    alike = np.bincount(labels.ravel(), looks.ravel(), count) / np.maximum(areas[:, cv2.CC_STAT_AREA], 1)
+    largest = int(sizes.argmax())
+    whole = sizes >= s.least_piece * sizes[largest]
+    return (sizes >= SPECK_PX) & (whole | (alike >= s.least_alike * alike[largest])), labels.astype(np.int32)

@@ -130,12 +130,21 @@ def test_a_hand_of_the_objects_color_that_was_left_out_stays_out(scene: StaticSc
     assert overlap(found.mask, body) > 0.9
 
 
-def test_a_half_behind_a_finger_stays_and_a_speck_does_not(scene: StaticScene, network: PixelNetwork) -> None:
-    body, finger, speck = box(60, 50), box(76, 46, 6, 32), box(60, 84, 8, 6)
+def test_a_half_or_a_corner_behind_a_finger_stays_and_a_speck_does_not(
+    scene: StaticScene, network: PixelNetwork
+) -> None:
+    """The corner and the speck are of one size; the speck is of a colour between the object's and the table's."""
+    body, finger = box(60, 50), box(76, 46, 6, 32)
+    corner, speck = box(60, 84, 8, 6), box(84, 84, 8, 6)
     halves = body & ~finger
-    seen = looked(picture(scene, halves | speck, 82, finger), scene, halves | speck)
+    frame = picture(scene, halves | corner | speck, 82, finger)
+    frame.color_rgb[speck] = (0.75 * np.array(DARK) + 0.25 * np.array(WOOD)).astype(np.uint8)
+    seen = looked(frame, scene, halves | corner | speck)
+    odds = network.log_odds(seen.features)
+    assert odds[speck[seen.at]].mean() < 0.5 * odds[halves[seen.at]].mean()
     found = redrawn(seen, network, SIZE, BACKGROUND, SETTINGS).mask
     assert not found[speck].any()
+    assert found[corner].mean() > 0.8
     assert found[halves & box(60, 50, 14)].mean() > 0.9
     assert found[halves & box(84, 50, 12)].mean() > 0.9
 
