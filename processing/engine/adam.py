@@ -16,7 +16,7 @@ class Adam:
     """
 
     def __init__(self, parameters: Sequence[Tensor], learning_rate: float, weight_decay: float = 0.0) -> None:
-        self._parameters, self._rate, self._weight_decay = list(parameters), learning_rate, weight_decay
+        self._parameters, self._rate, self._decay = list(parameters), learning_rate, weight_decay
         self._mean, self._square = ([torch.zeros_like(p) for p in self._parameters] for _ in range(2))
         self._steps = [torch.zeros((), device=p.device) for p in self._parameters]
 
@@ -25,7 +25,7 @@ class Adam:
         """One step along the gradients, which are used up; the learning rate decays by this factor."""
         gradients = [p.grad if p.grad is not None else torch.zeros_like(p) for p in self._parameters]
         adam(self._parameters, gradients, self._mean, self._square, [], self._steps, fused=True, amsgrad=False,
-             beta1=0.9, beta2=0.99, lr=self._rate, weight_decay=self._weight_decay, eps=1e-8, maximize=False)  # fmt: skip
+             beta1=0.9, beta2=0.99, lr=self._rate, weight_decay=self._decay, eps=1e-8, maximize=False)  # fmt: skip
         self._rate *= decay
         for parameter in self._parameters:
             parameter.grad = None

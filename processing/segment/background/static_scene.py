@@ -12,8 +12,8 @@ from jaxtyping import Bool, Float, Float32
 from numpy import ndarray as Array
 
 from processing.engine.parts import in_parts
-from processing.segment.background.moving_camera import refuse_moving_camera
 from processing.segment.background.channels import most_of_channels
+from processing.segment.background.moving_camera import refuse_moving_camera
 from processing.sensor.noise import stereo_sigma_m
 from recordings.constants import MAD_TO_SIGMA_SHORT
 from recordings.errors import BadInput

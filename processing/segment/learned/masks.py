@@ -56,7 +56,7 @@ class LearnedSettings:
     """... and outside of it for every size of the object beyond `border_px`."""
     border_px: float = 2.0
     least_piece: float = 0.1
-    """A piece smaller than this share of the largest one is a speck (of a finger, more often than of the object), ..."""
+    """A piece smaller than this share of the largest one is a speck (more often of a finger than of the object), ..."""
     least_alike: float = 0.5
     """... unless its log-odds are this share of the largest one's: a corner behind a finger looks like the object."""
     blocks: int = 6
