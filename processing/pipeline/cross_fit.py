@@ -16,6 +16,7 @@ from numpy import ndarray as Array
 from processing.images import Images
 from processing.refine.image_residuals import FAR_M, Explained, difference
 from processing.run import Run, each
+from processing.stages.carry import carry
 from processing.stages.fuse import fuse_frames
 from processing.stages.judge import judge, residuals
 from processing.stages.track import TrackResult, track
@@ -36,12 +37,13 @@ FOLDS = 3
 def cross_fitted(
     run: Run, images: Mapping[int, Images], tracks: Mapping[int, Done], alone: Mapping[int, Done[TrackResult]]
 ) -> dict[int, Done]:
-    """The tracks of tosses in one object frame, each the best of: what it was, refined on the others' shape, and, of a
-    toss that tracked `alone` left a rotation open or lost frames, the object located anew on that shape. It goes on
-    while tosses gain by it."""
+    """The tracks of tosses in one object frame, each the best of: what it was, or was `alone` where that surely fits
+    better; refined on the others' shape; and, of a toss that tracked alone left a rotation open or lost frames, the
+    object located anew on that shape. It goes on while tosses gain by it."""
     best, results = dict(tracks), {t: alone[t].result for t in tracks}
     if len(best) < 2:
         return best
+    best = each(run, best, lambda t: unbent(run, t, tracks[t], alone[t], images[t]))
     again = tuple(best)
     misfits = own_misfits(run, best, images)
     for turn in range(TURNS):
@@ -73,6 +75,17 @@ def refitted(
 ) -> dict[int, Done]:
     """Tosses on the shape of others; `results`: how sure each one's track was."""
     return each(run, tracks, lambda t: chosen(run, tracks[t], results[t], shape, images[t]))
+
+
+def unbent(run: Run, toss: int, together: Done, alone: Done, images: Images) -> Done:
+    """The track of a toss that was refined together with the others; or as the toss alone had it, where its frames fit
+    themselves better so, by more than chance."""
+    own = carry(run, toss, together, alone) if together.key != alone.key else None
+    if own is None or not own.result.frames:
+        return together
+    stiff, bent = (on_itself(run, done, images) for done in (own, together))
+    gap = difference(stiff, bent, misfit_of)
+    return own if gap.mean > gap.by_chance and stiff.lost <= bent.lost else together
 
 
 def own_misfits(run: Run, tracks: Mapping[int, Done], images: Mapping[int, Images]) -> dict[int, float]:

@@ -9,6 +9,7 @@ from processing.pipeline import notices as say
 from processing.pipeline.passes import Pass
 from processing.run import Run
 from processing.segment.background.depth_scale import posterior_sigma
+from processing.stages.carry import CarryResult
 from processing.stages.lose import lose
 from processing.stages.recording.every_frame import masks_in_every_frame, poses_in_every_frame
 from processing.stages.recording.rig import RigResult
@@ -31,7 +32,7 @@ def write_record(
     tracks, shapes = {**last.tracks, **lost}, {**last.shapes, **dict.fromkeys(lost, last.shape)}
     scale_sigma, first = posterior_sigma(rig.result.scale_sigma, run.config.rig.scale), min(last.tracks)
     moved = posed_together(last.tracks, alone)
-    on_shape = {t: alone[t] for t in moved if not isinstance(last.tracks[t].result, RegisterResult)}
+    on_shape = {t: alone[t] for t in moved if not isinstance(last.tracks[t].result, (RegisterResult, CarryResult))}
 
     def of_toss(t: int) -> TossRecord:
         poses = poses_in_every_frame(run, t, tracks[t], (first, tracks[first]), scale_sigma, on_shape.get(t))

@@ -15,10 +15,11 @@ from processing.pipeline import cross_fit, first_pass
 from processing.pipeline.start import start_run
 from processing.refine.image_residuals import Explained
 from processing.run import Run
+from processing.stages.carry import carried
 from processing.stages.track import TrackResult
 from processing.store import Done
 from recordings.errors import BadInput
-from recordings.geometry import rotation_angle_rad, rotation_exp
+from recordings.geometry import rotation_angle_rad, rotation_exp, skew
 from recordings.progress import Silent
 from recordings.results.folder import read_track, write_masks, write_track
 from recordings.session import Session
@@ -110,12 +111,46 @@ def test_a_frame_without_a_pose_is_no_way_to_fit_better(tiny_world: Any, tmp_pat
 
 def test_a_toss_that_drifted_is_put_right_on_the_shape_of_the_other(tiny_world: Any, tmp_path: Path) -> None:
     tosses = Tosses(tiny_world, tmp_path, 2)
-    tracks = {0: tosses.track(0, 0 * TURN, "track-0"), 1: tosses.track(1, TURN, "track-1")}
-    alone: Any = {t: Done(tmp_path, f"alone-{t}", SURE, False) for t in tracks}
-    fitted = cross_fit.cross_fitted(tosses.run, tosses.images, tracks, alone)
+    tracks: Any = {0: tosses.track(0, 0 * TURN, "track-0"), 1: tosses.track(1, TURN, "track-1")}
+    fitted = cross_fit.cross_fitted(tosses.run, tosses.images, tracks, tracks)
     assert tosses.off_deg(1, tracks[1]) > 9
     assert tosses.off_deg(1, fitted[1]) < 2
     assert tosses.off_deg(0, fitted[0]) < 2
+
+
+@pytest.mark.parametrize(("alone_turn", "bent_turn", "kept"), [(0, 2, "carry"), (2, 0, "bent"), (0, 0, "bent")])
+def test_a_toss_that_registration_bent_is_as_it_was_alone(
+    alone_turn: int, bent_turn: int, kept: str, tiny_world: Any, tmp_path: Path
+) -> None:
+    tosses = Tosses(tiny_world, tmp_path, 1, frames=16)
+    alone, bent = (tosses.track(0, k * TURN, name) for k, name in ((alone_turn, "alone"), (bent_turn, "bent")))
+    chosen = cross_fit.unbent(tosses.run, 0, bent, alone, tosses.images[0])
+    assert chosen.name.startswith(kept) or chosen.key == kept
+    poses, others = (read_track(d.folder, 0).camera_from_object for d in (chosen, bent))
+    for pose, true in zip(poses, tosses.truth(0), strict=True):  # whatever its object frame, it moves as it truly did
+        np.testing.assert_allclose(pose @ np.linalg.inv(poses[0]), true @ np.linalg.inv(tosses.truth(0)[0]), atol=1e-6)
+    turned = [np.degrees(rotation_angle_rad(a[:3, :3].T @ b[:3, :3])) for a, b in zip(poses, others, strict=True)]
+    assert np.median(turned) < 10  # in the object frame of all
+
+
+def test_a_carried_track_moves_alike_and_is_as_sure_of_every_point(tiny_world: Any, tmp_path: Path) -> None:
+    tosses = Tosses(tiny_world, tmp_path, 1)
+    own = read_track(tosses.track(0, TURN, "alone").folder, 0)
+    rng = np.random.default_rng(0)
+    half = rng.normal(size=(len(own.status), 6, 6)) * 1e-3
+    own = replace(own, covariance=half @ half.transpose(0, 2, 1))
+    motion = np.eye(4)
+    motion[:3, :3], motion[:3, 3] = rotation_exp(np.array([0.4, -1.0, 0.3])), [0.05, -0.02, 0.1]
+    moved = carried(own, motion, "object")
+    for i, pose in enumerate(own.camera_from_object):
+        np.testing.assert_allclose(moved.camera_from_object[i] @ np.linalg.inv(motion), pose, atol=1e-12)
+        point = np.array([0.03, 0.01, -0.02])  # own object frame
+        spread = []
+        for track, at in ((own, point), (moved, (np.linalg.inv(motion) @ [*point, 1])[:3])):
+            arm = track.camera_from_object[i, :3, :3] @ at
+            J = np.hstack([-skew(arm), np.eye(3)])
+            spread.append(J @ track.covariance[i] @ J.T)
+        np.testing.assert_allclose(spread[0], spread[1], atol=1e-15)
 
 
 def test_the_worst_toss_comes_first_and_every_toss_once(
@@ -273,6 +308,6 @@ def test_tosses_that_show_nothing_sure_correct_no_other(tiny_world: Any, tmp_pat
         track = read_track(done.folder, toss)
         lost: Any = ("lost",) * 8
         write_track(done.folder, replace(track, camera_from_object=np.full((8, 4, 4), np.nan), status=lost))
-    alone: Any = {t: Done(tmp_path, f"alone-{t}", SURE, False) for t in tracks}
-    assert cross_fit.cross_fitted(tosses.run, tosses.images, tracks, alone) == tracks
+    same: Any = tracks
+    assert cross_fit.cross_fitted(tosses.run, tosses.images, tracks, same) == tracks
     assert tosses.misfit(tracks[0]) == pytest.approx(np.log(0.02))
