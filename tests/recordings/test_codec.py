@@ -49,16 +49,13 @@ def cpu_ms(work, times: int = 12) -> float:
 
 
 @pytest.mark.parametrize("folder", DEPTH_FOLDERS)
-def test_depth_packs_three_times_faster_than_png_and_never_larger(data, folder):
-    files = sorted(data(folder).glob("*.png"))[5:40:10]
-    ratios = []
-    for file in files:
+def test_packed_depth_is_never_larger_than_png(data, folder):
+    """How much faster it packs: `tools/bench_session.py`."""
+    for file in sorted(data(folder).glob("*.png"))[5:40:10]:
         raw = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
         packed = pack_depth(raw)
         np.testing.assert_array_equal(unpack_depth(packed, *raw.shape), raw)
         assert len(packed) <= len(cv2.imencode(".png", raw)[1])
-        ratios.append(cpu_ms(lambda raw=raw: cv2.imencode(".png", raw)) / cpu_ms(lambda raw=raw: pack_depth(raw)))
-    assert np.median(ratios) > 3.0  # measured 4.1 to 4.8
 
 
 def test_depth_that_cannot_be_unpacked_is_named():
