@@ -26,7 +26,7 @@ class DepthScaleSettings:
     """With a smaller share of the image the table is hardly in view."""
     tolerance_m: float = 0.008
     place_m: float = 0.0025
-    """Standard deviation of the calibrated distance between camera and table, whatever the tilt. The likeliest of .25 to
+    """Standard deviation of the calibrated way between camera and table, whatever the tilt. The likeliest of .25 to
     6 mm on 800 drawn calibrations that are off by up to 8 mm and 1 degree, half of them turned about the camera, half
     about the table (`tools/bench_depth_scale.py`); twice as much costs .2 nats, half as much .5."""
     sensor_sigma: float = 0.0005
