@@ -87,7 +87,8 @@ class DepthErrors:
         right[6 * count :] += np.einsum("cij,cj->ci", self._prior, self.relative).ravel()
         crossed = whole[6 * count :, : 6 * count]
         sides = np.concatenate([crossed, right[6 * count :, None]], 1)
-        self._gain = cho_solve(cho_factor(among, lower=True, overwrite_a=True), sides)
+        factor = cho_factor(among, lower=True, overwrite_a=True, check_finite=False)
+        self._gain = cho_solve(factor, sides, check_finite=False)
         poses_only = whole[: 6 * count, : 6 * count] - crossed.T @ self._gain[:, :-1]
         H += poses_only.reshape(count, 6, count, 6).transpose(0, 2, 1, 3) / self._shared
         g += (right[: 6 * count] - crossed.T @ self._gain[:, -1]).reshape(count, 6) / self._shared
@@ -117,12 +118,9 @@ def _spans(store: ViewStore, index: Int[Array, " c"]) -> tuple[Float[Array, "c 4
 
 def _means(store: ViewStore, index: Int[Array, " c"], boxes: Float[Array, "c 4"], side: int) -> Float[Array, "c k"]:
     """What each node of a view's grid adds to the mean error of its samples."""
-    (fx, fy), (cx, cy) = store.rectified.focal, store.rectified.center
     out = np.zeros((len(index), side * side))
-    at, share = np.zeros(kernels.CORNERS, dtype=np.int64), np.zeros(kernels.CORNERS)
+    focal, center = store.rectified.focal, store.rectified.center
     for row, i in enumerate(index):
         first, count = store.table[i, lay.FIRST], store.table[i, lay.COUNT]
-        for x, y, z in store.samples[first : first + count, : lay.PZ + 1].astype(np.float64):
-            kernels.nodes_around(fx * x / z + cx, fy * y / z + cy, boxes[row], side, at, share)
-            out[row, at] += share / count
+        kernels.add_shares(store.samples[first : first + count], focal, center, boxes[row], side, out[row])
     return out

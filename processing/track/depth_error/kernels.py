@@ -59,7 +59,7 @@ CORNERS = 4
 
 
 @no_type_check
-@njit(cache=True, error_model="numpy", nogil=True)
+@njit(cache=True, error_model="numpy", nogil=True, fastmath=True, inline="always")
 def nodes_around(u, v, box, side, at, share):
     """The nodes around a pixel of the image, and each one's share there (bilinear). box: first node (u, v), and the
     nodes' distances (pixels)."""
@@ -74,46 +74,115 @@ def nodes_around(u, v, box, side, at, share):
 
 @no_type_check
 @njit(cache=True, error_model="numpy", nogil=True)
-def _add(at, J, count, r, weight, H, g):
-    """One residual whose derivative by the unknowns `at` is J."""
-    for a in range(count):
-        w = weight * J[a]
-        g[at[a]] += w * r
-        for b in range(count):
-            H[at[a], at[b]] += w * J[b]
+def add_shares(samples, focal, center, box, side, out):
+    """What each node adds to the mean error of a view's samples."""
+    at, share = np.empty(CORNERS, np.int64), np.empty(CORNERS)
+    for p in samples:
+        u, v = focal[0] * p[PX] / p[PZ] + center[0], focal[1] * p[PY] / p[PZ] + center[1]
+        nodes_around(u, v, box, side, at, share)
+        for a in range(CORNERS):
+            out[at[a]] += share[a] / samples.shape[0]
 
 
 @no_type_check
-@njit(cache=True, error_model="numpy", nogil=True)
-def _derivatives(slope, moved, x, y, z, share, J):
-    """Those of a residual whose derivative by the point is `slope`: by the twist, then by the errors at the point's own
-    nodes, whose shares are `share`: it moves by `moved` along its ray."""
-    along = slope[0] * moved[0] + slope[1] * moved[1] + slope[2] * moved[2]
-    J[0], J[1], J[2] = slope[0], slope[1], slope[2]
-    J[3], J[4], J[5] = y * slope[2] - z * slope[1], z * slope[0] - x * slope[2], x * slope[1] - y * slope[0]
+@njit(cache=True, error_model="numpy", nogil=True, fastmath=True)
+def _add_twist(sx, sy, sz, x, y, z, H, row):
+    """Adds to a row of H the derivative by the twist of what changes with the point (x, y, z) by (sx, sy, sz)."""
+    H[row, 0], H[row, 1], H[row, 2] = H[row, 0] + sx, H[row, 1] + sy, H[row, 2] + sz
+    H[row, 3] += y * sz - z * sy
+    H[row, 4] += z * sx - x * sz
+    H[row, 5] += x * sy - y * sx
+
+
+@no_type_check
+@njit(cache=True, error_model="numpy", nogil=True, fastmath=True, inline="always")
+def _add_slope(slope, r, weight, among):
+    """One residual's share in its point's sums (`_add_point`)."""
+    wx, wy, wz = weight * slope[0], weight * slope[1], weight * slope[2]
+    among[0], among[1], among[2] = among[0] + wx * slope[0], among[1] + wx * slope[1], among[2] + wx * slope[2]
+    among[3], among[4], among[5] = among[3] + wy * slope[1], among[4] + wy * slope[2], among[5] + wz * slope[2]
+    among[6], among[7], among[8] = among[6] + wx * r, among[7] + wy * r, among[8] + wz * r
+
+
+@no_type_check
+@njit(cache=True, error_model="numpy", nogil=True, fastmath=True)
+def _add_shading(slope, along, K, r, weight, x, y, z, first, H, g, with_own):
+    """What a residual adds whose derivatives by three unknowns of the pair's shading, from `first` on, are K; `along`:
+    that by the point's own error, whose products with shading are summed in `with_own`."""
+    for a in range(3):
+        w = weight * K[a]
+        g[first + a] += w * r
+        with_own[first + a] += w * along
+        _add_twist(w * slope[0], w * slope[1], w * slope[2], x, y, z, H, first + a)
+        H[first + a, first] += w * K[0]
+        H[first + a, first + 1] += w * K[1]
+        H[first + a, first + 2] += w * K[2]
+
+
+@no_type_check
+@njit(cache=True, error_model="numpy", nogil=True, fastmath=True)
+def _add_other(slope, along, by_error, r, weight, x, y, z, at, share, own_at, own_share, H, g):
+    """What a residual adds whose derivative by the other view's error, whose nodes are `at`, is `by_error`."""
     for a in range(CORNERS):
-        J[TWIST + a] = share[a] * along
+        w = weight * by_error * share[a]
+        g[at[a]] += w * r
+        _add_twist(w * slope[0], w * slope[1], w * slope[2], x, y, z, H, at[a])
+        w_along, w_error = w * along, w * by_error
+        for b in range(CORNERS):
+            H[at[a], own_at[b]] += w_along * own_share[b]
+            H[at[a], at[b]] += w_error * share[b]
 
 
 @no_type_check
-@njit(cache=True, error_model="numpy", nogil=True)
+@njit(cache=True, error_model="numpy", nogil=True, fastmath=True)
+def _add_point(among, x, y, z, moved, at, share, with_own, H, g):
+    """All residuals of one point, by the twist and by the point's own error, by which it moves by `moved` along its ray
+    and whose nodes are `at`. among: of the weights w, values r and slopes s the sums w s s' (xx, xy, xz, yy, yz, zz)
+    and w s r; it and `with_own` begin anew."""
+    xx, xy, xz, yy, yz, zz = among[0], among[1], among[2], among[3], among[4], among[5]
+    tx, ty, tz = among[6], among[7], among[8]
+    _add_twist(xx, xy, xz, x, y, z, H, 0)
+    _add_twist(xy, yy, yz, x, y, z, H, 1)
+    _add_twist(xz, yz, zz, x, y, z, H, 2)
+    _add_twist(y * xz - z * xy, y * yz - z * yy, y * zz - z * yz, x, y, z, H, 3)
+    _add_twist(z * xx - x * xz, z * xy - x * yz, z * xz - x * zz, x, y, z, H, 4)
+    _add_twist(x * xy - y * xx, x * yy - y * xy, x * yz - y * xz, x, y, z, H, 5)
+    g[0], g[1], g[2] = g[0] + tx, g[1] + ty, g[2] + tz
+    g[3], g[4], g[5] = g[3] + y * tz - z * ty, g[4] + z * tx - x * tz, g[5] + x * ty - y * tx
+    mx, my, mz = moved[0], moved[1], moved[2]
+    qx, qy, qz = xx * mx + xy * my + xz * mz, xy * mx + yy * my + yz * mz, xz * mx + yz * my + zz * mz
+    own, of_own = mx * qx + my * qy + mz * qz, mx * tx + my * ty + mz * tz
+    for a in range(CORNERS):
+        part = share[a]
+        g[at[a]] += part * of_own
+        _add_twist(part * qx, part * qy, part * qz, x, y, z, H, at[a])
+        for b in range(TWIST, POSE):
+            H[at[a], b] += part * with_own[b]
+        part *= own
+        for b in range(CORNERS):
+            H[at[a], at[b]] += part * share[b]
+    among[:] = 0.0
+    with_own[:] = 0.0
+
+
+@no_type_check
+@njit(cache=True, error_model="numpy", nogil=True, fastmath=True)
 def pair_terms(  # noqa: C901
     samples, step, pose, maps, row, focal, center, level, s_geo, s_int, s_out, side, boxes, errors, H, g
 ):
     """Adds normal equations of `samples` of one view seen by another, at its corrected depth.
 
     pose: 4x4 other_from_sample_camera. boxes (2, 4), errors (2, nodes): grids (`nodes_around`) and relative errors of
-    both views' depth. H, g: of the twist of the points in the other camera's frame, of the pair's shading, of the
-    sampled view's errors, and of the other one's. Returns cost sum, points counted, points on the surface, violations,
-    as `track/kernels.py` does.
+    both views' depth. H (its lower triangle), g: of the twist of the points in the other camera's frame, of the pair's
+    shading, of the sampled view's errors, and of the other one's. Returns cost sum, points counted, points on the
+    surface, violations, as `track/kernels.py` does.
     """
     # long because: one compiled loop over points, as in track/kernels.py
     off, u0, v0, w, h = row[OFFSET], row[U0], row[V0], row[WIDTH], row[HEIGHT]
     fx, fy, cx, cy = focal[0], focal[1], center[0], center[1]
     wg, wi, wo = 1.0 / (s_geo * s_geo), 1.0 / (s_int * s_int), 1.0 / (s_out * s_out)
     nodes = side * side
-    most = TWIST + 3 + 2 * CORNERS
-    at, J = np.arange(most), np.empty(most)
+    among, with_own, K = np.zeros(9), np.zeros(POSE), np.empty(3)
     own, own_share = np.empty(CORNERS, np.int64), np.empty(CORNERS)
     other, other_share = np.empty(CORNERS, np.int64), np.empty(CORNERS)
     slope, moved = np.empty(3), np.empty(3)
@@ -125,7 +194,7 @@ def pair_terms(  # noqa: C901
         longer = 1.0
         for a in range(CORNERS):
             longer += own_share[a] * errors[0, own[a]]
-            at[TWIST + a] = POSE + own[a]
+            own[a] += POSE
         for a in range(3):
             moved[a] = pose[a, 0] * p[PX] + pose[a, 1] * p[PY] + pose[a, 2] * p[PZ]
         x, y, z = longer * moved[0] + pose[0, 3], longer * moved[1] + pose[1, 3], longer * moved[2] + pose[2, 3]
@@ -152,8 +221,8 @@ def pair_terms(  # noqa: C901
             against += 1
             if r < 6.0 and s_out < 1.0:
                 slope[0], slope[1], slope[2] = outline_slope(maps, near, w, fy / fx, x, y, iz)
-                _derivatives(slope, moved, x, y, z, own_share, J)
-                _add(at, J, TWIST + CORNERS, gap, wo / (1.0 + r * r / 4.0), H, g)
+                _add_slope(slope, gap, wo / (1.0 + r * r / 4.0), among)
+                _add_point(among, x, y, z, moved, own, own_share, with_own, H, g)
             continue
         mx = pose[0, 0] * p[SNX] + pose[0, 1] * p[SNY] + pose[0, 2] * p[SNZ]
         my = pose[1, 0] * p[SNX] + pose[1, 1] * p[SNY] + pose[1, 2] * p[SNZ]
@@ -171,18 +240,20 @@ def pair_terms(  # noqa: C901
             stretch = 1.0
             for a in range(CORNERS):
                 stretch += other_share[a] * errors[1, other[a]]
+                other[a] += POSE + nodes
             toward = nx * x + ny * y + nz * z
             r_m = toward * (1.0 - stretch * zr * iz)
             r = r_m / s_geo
             if abs(r) < 3.0 and nx * mx + ny * my + nz * mz > 0.5:
                 fits = True
                 slope[0], slope[1], slope[2] = nx, ny, nz
-                _derivatives(slope, moved, x, y, z, own_share, J)
-                for a in range(CORNERS):
-                    at[TWIST + CORNERS + a] = POSE + nodes + other[a]
-                    J[TWIST + CORNERS + a] = -toward * zr * iz * other_share[a]
                 k = 1.0 - r * r / 9.0
-                _add(at, J, TWIST + 2 * CORNERS, r_m, wg * k * k, H, g)
+                k *= wg * k
+                along = nx * moved[0] + ny * moved[1] + nz * moved[2]
+                _add_slope(slope, r_m, k, among)
+                _add_other(
+                    slope, along, -toward * zr * iz, r_m, k, x, y, z, other, other_share, own, own_share, H, g
+                )  # fmt: skip
                 on += 1
                 cost += 0.5 * min(r * r / 9.0, 1.0)
             else:
@@ -196,7 +267,9 @@ def pair_terms(  # noqa: C901
             foreign = max(max(maps[q, ch], maps[q + 1, ch]), max(maps[q + w, ch], maps[q + w + 1, ch]))
             if max(foreign, p[SSHARP]) > 0.5 * NO_APPEARANCE:
                 cost += 0.5 * COVERED_COST
+                _add_point(among, x, y, z, moved, own, own_share, with_own, H, g)
                 continue
+            K[0], K[1], K[2] = p[SNX] - mx, p[SNY] - my, p[SNZ] - mz
             for c in range(APPEARANCE):
                 ch = level * APPEARANCE + c
                 e, k, gu, gv = appearance_step(maps, q, w, u - ju, v - jv, ch, p[SSHARP + ch], s_int)
@@ -205,12 +278,11 @@ def pair_terms(  # noqa: C901
                 if k > 0.0:
                     slope[0], slope[1] = gu * fx * iz, gv * fy * iz
                     slope[2] = -(slope[0] * x + slope[1] * y) * iz
-                    _derivatives(slope, moved, x, y, z, own_share, J)
-                    first = TWIST + CORNERS
-                    for a in range(3):
-                        at[first + a] = TWIST + 3 * c + a
-                    J[first], J[first + 1], J[first + 2] = p[SNX] - mx, p[SNY] - my, p[SNZ] - mz
-                    _add(at, J, first + 3, e, wi * k, H, g)
+                    k *= wi
+                    along = slope[0] * moved[0] + slope[1] * moved[1] + slope[2] * moved[2]
+                    _add_slope(slope, e, k, among)
+                    _add_shading(slope, along, K, e, k, x, y, z, TWIST + 3 * c, H, g, with_own)
+            _add_point(among, x, y, z, moved, own, own_share, with_own, H, g)
     return cost, seen, on, against
 
 
@@ -223,9 +295,12 @@ def _without_shading(H, g, sigma):
         S[a, a] += 1.0 / (sigma * sigma)
     n = H.shape[0] - SHADING
     B, rest = np.empty((SHADING, n)), np.empty((n, n))
-    B[:, :TWIST], B[:, TWIST:] = H[TWIST:POSE, :TWIST], H[TWIST:POSE, POSE:]
-    rest[:TWIST, :TWIST], rest[TWIST:, TWIST:] = H[:TWIST, :TWIST], H[POSE:, POSE:]
-    rest[:TWIST, TWIST:], rest[TWIST:, :TWIST] = H[:TWIST, POSE:], H[POSE:, :TWIST]
+    B[:, :TWIST], B[:, TWIST:] = H[TWIST:POSE, :TWIST], H[POSE:, TWIST:POSE].T
+    rest[:TWIST, :TWIST] = H[:TWIST, :TWIST]
+    for a in range(TWIST, n):
+        for b in range(a + 1):
+            rest[a, b] = H[a + SHADING, b if b < TWIST else b + SHADING]
+            rest[b, a] = rest[a, b]
     gain = np.linalg.solve(S, B)
     left = np.empty(n)
     left[:TWIST], left[TWIST:] = g[:TWIST], g[POSE:]

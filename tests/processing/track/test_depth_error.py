@@ -122,6 +122,7 @@ def one_pair(errors: np.ndarray, side: int = 3):
     mine = store.samples[: store.table[0, lay.COUNT]]
     pose = poses[1] @ se3.inverse(poses[0])
     e.pair_terms(mine, 1, pose, store.maps, store.table[1], FOCAL, CENTER, 0, *row[2:5], side, boxes, errors, H, g)
+    H = np.tril(H) + np.tril(H, -1).T
     plain = np.zeros((6, 6)), np.zeros(6), np.zeros((6, k.SHADING)), np.zeros((k.SHADING + 1, k.SHADING))
     k.pair_terms(mine, 1, pose, store.maps, store.table[1], FOCAL, CENTER, 0, *row[2:5], False, True, plain[0],
                  plain[1], plain[0], plain[1], plain[2], plain[3])  # fmt: skip
