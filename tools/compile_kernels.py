@@ -41,6 +41,7 @@ KERNELS: dict[tuple[str, str], list[tuple[str, ...]]] = {
     (TRACK, "view_terms"): [(M, I8, VI, T, M4, M4, MI, V, V, V, M, V)],
     (TRACK, "to_object"): [(M, V, M, F8, M, V)],
     (DEPTH_ERROR, "add_pairs"): [(T, MI, F8, VI, VI, I8, M, M, F8, M4, M4, MI, V, V, V, M, V, M)],
+    (DEPTH_ERROR, "add_shares"): [(M4, V, V, V, I8, V)],
     (FLIGHT, "fit_flights"): [(M, MI, V, V, M4, M4, MI, V, V, M, F8)],
     (PROFILE, "surface_terms"): [(M4, M, M, V, V, VB, VI, V, F8, F8, M, V, M, M, V)],
     (PROFILE, "outline_terms"): [(V4, VI, V, V, M, M, V, V, VB, VI, V, F8, M, V, M, M, V)],
