@@ -87,8 +87,7 @@ class DepthErrors:
         right[6 * count :] += np.einsum("cij,cj->ci", self._prior, self.relative).ravel()
         crossed = whole[6 * count :, : 6 * count]
         sides = np.concatenate([crossed, right[6 * count :, None]], 1)
-        factor = cho_factor(among, lower=True, overwrite_a=True, check_finite=False)
-        self._gain = cho_solve(factor, sides, check_finite=False)
+        self._gain = cho_solve(cho_factor(among, lower=True, overwrite_a=True), sides)
         poses_only = whole[: 6 * count, : 6 * count] - crossed.T @ self._gain[:, :-1]
         H += poses_only.reshape(count, 6, count, 6).transpose(0, 2, 1, 3) / self._shared
         g += (right[: 6 * count] - crossed.T @ self._gain[:, -1]).reshape(count, 6) / self._shared
