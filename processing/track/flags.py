@@ -195,8 +195,9 @@ def _in_gap(
 
 
 SURE_DEG, SURE_M = 5.0, 0.02
-"""What a published `tracked` promises: standard deviations of a pose's rotation and place below these, of which the
-first is the field's limit of a right pose (5 degrees, 5 cm). Inside, surer than `FlagConfig.unsure_deg` will do."""
+"""What a published `tracked` promises: root mean squares of the angle and of the distance by which a pose is off, over
+all three axes, below these, of which the first is the field's limit of a right pose (5 degrees, 5 cm). Inside, surer
+than `FlagConfig.unsure_deg` will do."""
 
 
 def with_shape_error(track: ObjectTrack, alone: ObjectTrack) -> ObjectTrack:
@@ -226,7 +227,7 @@ def published(track: ObjectTrack) -> ObjectTrack:
     status = list(track.status)
     for i, covariance in enumerate(track.covariance):
         if status[i] == "tracked" and np.isfinite(covariance).all():
-            turn, place = (np.linalg.eigvalsh(covariance[a : a + 3, a : a + 3])[-1] for a in (0, 3))
+            turn, place = (np.trace(covariance[a : a + 3, a : a + 3]) for a in (0, 3))
             if turn > np.radians(SURE_DEG) ** 2 or place > SURE_M**2:
                 status[i] = "interpolated"
     return replace(track, status=tuple(status))

@@ -133,11 +133,18 @@ def test_what_was_lost_alone_is_as_unsure_as_the_rest_in_the_mean_and_lost_poses
     assert with_shape_error(alone, nowhere) is alone
 
 
-@pytest.mark.parametrize(("turn_deg", "place_m", "sure"), [(0.9, 0.9, True), (1.1, 0.1, False), (0.1, 1.1, False)])
-def test_tracked_promises_five_degrees_and_two_centimetres(turn_deg: float, place_m: float, sure: bool) -> None:
+@pytest.mark.parametrize(
+    ("turns", "places", "sure"),
+    [((0, 0.9, 0), (0, 0, 0.9), True), ((0, 1.1, 0), (0, 0, 0.1), False), ((0, 0.1, 0), (0, 0, 1.1), False),
+     ((0.55,) * 3, (0.55,) * 3, True), ((0.6,) * 3, (0.1,) * 3, False), ((0.1,) * 3, (0.6,) * 3, False)],
+)  # fmt: skip
+def test_tracked_promises_five_degrees_and_two_centimetres(
+    turns: tuple[float, ...], places: tuple[float, ...], sure: bool
+) -> None:
+    """Shares of the promise about and along each axis: the angle and the distance that are off are over all three."""
     track = true_track()
     covariance = track.covariance.copy()
-    covariance[4] = np.diag([0, np.radians(SURE_DEG * turn_deg) ** 2, 0, 0, 0, (SURE_M * place_m) ** 2])
+    covariance[4] = np.diag(np.r_[np.radians(SURE_DEG) * np.array(turns), SURE_M * np.array(places)] ** 2)
     covariance[5] = np.nan  # not known
     said = published(replace(track, covariance=covariance)).status
     assert said[4] == ("tracked" if sure else "interpolated")
