@@ -181,6 +181,7 @@ def test_k3_counts_by_how_well_views_tell_it():
     assert abs(not_told) < 1e-4
 
 
+@pytest.mark.slow
 def test_where_points_of_a_view_err_alike_the_focal_lengths_deviation_says_so(geometry):
     """Each view's corners are drawn out along its own direction by a part in a thousand, as by motion or light."""
     true, far = geometry.camera("mono0", 620.0), []

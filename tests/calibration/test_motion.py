@@ -93,6 +93,7 @@ def squared_deviations(found, true):
     return [float(gap[k] @ np.linalg.solve(found.covariance[k, k], gap[k])) for k in (slice(3, 6), slice(0, 3))]
 
 
+@pytest.mark.slow
 def test_the_interval_holds_the_camera_where_its_lens_was_fitted_on_few_noisy_corners(geometry):
     held = {"lens as exact": 0, "lens as stated": 0}
     for seed in range(4):

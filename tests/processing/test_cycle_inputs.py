@@ -199,28 +199,30 @@ def test_a_lost_toss_changes_nothing_between_passes(tmp_path: Path) -> None:
     assert shifted == pytest.approx(0.002)
 
 
-def run_on_two_objects(tiny_world: Any, folder: Path, patch: pytest.MonkeyPatch) -> tuple[Path, Results]:
+@pytest.fixture(scope="module")
+def two_objects(tiny_world: Any, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Results]:
     """`ours` in scope all, where the second toss shows another object."""
+    folder = tmp_path_factory.mktemp("objects")
     session = tiny_world.record(folder / "tiny", frames=5, others=(1,))
-    patch.setattr("processing.cli.config_of", quick)
-    assert main([str(session), "--out", str(folder / "out")]) == 0
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("processing.cli.config_of", quick)
+        assert main([str(session), "--out", str(folder / "out")]) == 0
     return session, Results.open(folder / "out")
 
 
 @pytest.fixture(scope="module")
-def two_objects(tiny_world: Any, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Results]:
+def one_lost(two_objects: tuple[Path, Results], tmp_path_factory: pytest.TempPathFactory) -> Results:
+    """As `two_objects`, in both scopes, and the second toss shows too little for a shape of its own; up to there the
+    stages are those of `two_objects`."""
+    session, known = two_objects
+    out = tmp_path_factory.mktemp("objects") / "out"
+    shutil.copytree(known.path, out, ignore=shutil.ignore_patterns("reproject-*"))
     with pytest.MonkeyPatch.context() as patch:
-        return run_on_two_objects(tiny_world, tmp_path_factory.mktemp("objects"), patch)
-
-
-@pytest.fixture(scope="module")
-def one_lost(tiny_world: Any, tmp_path_factory: pytest.TempPathFactory) -> Results:
-    """As `two_objects`, in both scopes, and the second toss shows too little for a shape of its own."""
-    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("processing.cli.config_of", quick)
         patch.setattr("processing.pipeline.first_pass.own_shape", lambda *_: None)
-        session, results = run_on_two_objects(tiny_world, tmp_path_factory.mktemp("objects"), patch)
-        assert main([str(session), "--scope", "one", "--out", str(results.path)]) == 0
-    return Results.open(results.path)
+        for scope in ("all", "one"):
+            assert main([str(session), "--scope", scope, "--out", str(out)]) == 0
+    return Results.open(out)
 
 
 def test_a_toss_of_another_object_keeps_its_own_track_and_shape_and_is_not_learned_from(
