@@ -118,17 +118,16 @@ class _Painter:
 
     def _painted(self, triangle: Array, uv: Array, mask: Array) -> tuple[Array, Array]:
         """Colour 0..1 of each pixel, and whether a camera saw the surface there."""
-        corners = self._shape.faces[np.where(mask, triangle, 0)]
-        share = np.stack([1 - uv.sum(-1), uv[..., 0], uv[..., 1]], -1)[..., None]
-        rgb = (
-            np.full((len(self._shape.vertices_m), 3), 128, np.uint8)
-            if self._shape.vertex_rgb is None
-            else self._shape.vertex_rgb
-        )
-        color = np.where(mask[..., None], (rgb[corners] / 255.0 * share).sum(-2), 0).astype(np.float32)
-        seen = self._shape.observed
-        known = np.ones_like(mask) if seen is None else seen[corners].all(-1)
-        return color, known & mask
+        corners, uv = self._shape.faces[triangle[mask]], uv[mask]
+        color, known = np.zeros((*mask.shape, 3), dtype=np.float32), mask.copy()
+        if self._shape.vertex_rgb is None:
+            color[mask] = 128 / 255
+        else:
+            share = np.stack([1 - uv.sum(-1), uv[:, 0], uv[:, 1]], -1)
+            color[mask] = np.einsum("pcr,pc->pr", self._shape.vertex_rgb[corners] / 255.0, share)
+        if self._shape.observed is not None:
+            known[mask] = self._shape.observed[corners].all(-1)
+        return color, known
 
 
 def located(scene: Scene, view: int, model: ShapeViews, beam: BeamConfig, config: ShapeConfig) -> list[Candidate]:
