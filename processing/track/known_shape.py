@@ -7,13 +7,16 @@ colour in them, and a shape without colours has none anywhere.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray as Array
 
 from processing.features.sift import relative_motions
+from processing.motion import se3_kernels as se3
 from processing.motion.rotation_grid import all_turns
 from processing.sensor import view_layout as lay
 from processing.sensor.rectification import Rectification
@@ -22,6 +25,7 @@ from processing.track import kernels as k
 from processing.track.beam import BeamConfig, Candidate, Hypothesis, Scene, merged
 from processing.track.keyframes import references
 from processing.track.schedule import Schedule, rows
+from processing.track.windows import WindowConfig, change_costs, pair_costs
 from recordings.errors import BadInput
 from recordings.tracks import ObjectShape
 
@@ -33,14 +37,20 @@ class ShapeConfig:
     directions: int = 42
     """Views of the shape, spread evenly over all directions."""
     turns: int = 480
-    """Orientations tried in the first frame."""
+    """Orientations tried in a frame."""
     tried: int = 32
     """The best of them that are aligned coarsely ..."""
-    starts: int = 8
-    """... and of those, the ones that tracking starts from."""
+    starts: int = 10
+    """... and of those, the ones that paths may pass through."""
     spread: float = 0.12
-    """A start that fits worse than the best by more than this is none."""
+    """One that fits worse than the best by more than this is none."""
     seek: Schedule = ((1, 6, 0.015, 0.6, 0.012, 0.12),)
+    searched: int = 32
+    """Frames of a toss (stretches in which nothing moves count as one) in which all orientations are tried, spread
+    evenly; to the others the poses of those beside them are carried."""
+    unseen: float = 0.1
+    """Cost of a point of one frame that the next one does not see: else a body would rather show a new face each time
+    than one that has to agree."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,6 +156,99 @@ def located(scene: Scene, view: int, model: ShapeViews, beam: BeamConfig, config
     )
     good = [c for c in fine if c.fit < beam.lost and c.fit < fine[0].fit + config.spread]
     return good[: config.starts]
+
+
+def path_through(
+    scene: Scene, model: ShapeViews, beam: BeamConfig, windows: WindowConfig, config: ShapeConfig,
+    report: Callable[[float], None] = lambda _: None,
+) -> Float[Array, "n 4 4"]:  # fmt: skip
+    """camera_from_object of a toss's frames on a shape: each is located by itself, and the cheapest path through what
+    was found taken (Viterbi) by how the frames fit the shape, what pairs of them say of the motion between them, and
+    its changes. No pose rests on that of the frame before, so that no error is carried on. NaN where nothing fits.
+
+    `report` is told the share of the work that is done. Raises BadInput where the shape fits no frame."""
+    n = len(scene.times_s)
+    runs = scene.store.still_runs(np.array([scene.store.usable(i) for i in range(n)]))
+    found = _everywhere(scene, [run[len(run) // 2] for run in runs], model, beam, config, report)
+    runs = [run for run, here in zip(runs, found, strict=True) if here]
+    found = [here for here in found if here]
+    if not runs:
+        raise BadInput("the given shape fits nothing that the frames show; is it a shape of this object?")
+    poses = np.full((n, 4, 4), np.nan)
+    for run, pose in zip(runs, _cheapest(scene, runs, found, windows, config), strict=True):
+        poses[run] = pose
+    return poses
+
+
+def _everywhere(
+    scene: Scene, views: list[int], model: ShapeViews, beam: BeamConfig, config: ShapeConfig,
+    report: Callable[[float], None],
+) -> list[list[Candidate]]:  # fmt: skip
+    """Poses of each of these frames at which it fits the shape: found there, or beside it and carried on, forward and
+    then backward."""
+    n = len(scene.times_s)
+    drawn = np.arange(n, n + len(model.poses))
+    poses = np.concatenate([np.full((n, 4, 4), np.nan), model.poses])
+    searched = np.linspace(0, len(views) - 1, min(config.searched, len(views))).astype(int)
+    found: list[list[Candidate]] = [[] for _ in views]
+    for done, place in enumerate(searched):
+        report(done / len(searched))
+        found[place] = located(scene, views[place], model, beam, config)
+
+    def carry(one: int, other: int) -> None:
+        shift = scene.store.center_m[views[other]] - scene.store.center_m[views[one]]
+        moved = [_moved(c.pose, shift) for c in found[one]]
+        rough = merged([_fitted(scene, views[other], p, poses, drawn, beam.coarse, beam) for p in moved], beam)
+        fine = [_fitted(scene, views[other], c.pose, poses, drawn, beam.fine, beam) for c in rough]
+        every = merged([*found[other], *fine], beam)
+        found[other] = [c for c in every if c.fit < min(beam.lost, every[0].fit + config.spread)][: config.starts]
+
+    for one, other in pairwise(range(len(views))):
+        carry(one, other)
+    for one, other in pairwise(range(len(views) - 1, -1, -1)):
+        carry(one, other)
+    return found
+
+
+def _moved(pose: Float[Array, "4 4"], shift: Float[Array, "3"]) -> Float[Array, "4 4"]:
+    out = pose.copy()
+    out[:3, 3] += shift
+    return out
+
+
+def _cheapest(
+    scene: Scene, runs: list[list[int]], found: list[list[Candidate]], windows: WindowConfig, config: ShapeConfig
+) -> list[Float[Array, "4 4"]]:
+    """One pose of each run of frames."""
+    if len(runs) == 1:
+        return [found[0][0].pose]
+    distance_m = float(np.median(np.linalg.norm(scene.store.center_m[[run[0] for run in runs]], axis=1)))
+    row = rows(windows.compared, distance_m)[0]
+    fits = [len(run) * np.array([c.fit for c in here]) for run, here in zip(runs, found, strict=True)]
+    steps = [[[two.pose @ se3.inverse(one.pose) for two in after] for one in here] for here, after in pairwise(found)]
+    spans_s = np.array([scene.times_s[after[0]] - scene.times_s[run[-1]] for run, after in pairwise(runs)])
+
+    def pairs(step: int) -> Float[Array, "a b"]:
+        every = [motion for motions in steps[step] for motion in motions]
+        costs = pair_costs(scene, runs[step][-1], runs[step + 1][0], every, row, config.unseen)
+        return costs.reshape(len(found[step]), -1)
+
+    total, back = fits[0][:, None] + fits[1][None] + pairs(0), []
+    for step in range(1, len(steps)):
+        changes = np.zeros((len(found[step - 1]), len(found[step]), len(found[step + 1])))
+        if len(runs[step]) == 1:  # where it stood still the motions before and after have nothing to do with each other
+            free = scene.free([runs[step - 1][-1], *runs[step], runs[step + 1][0]])
+            for m, twos in enumerate(steps[step]):
+                ones = [motions[m] for motions in steps[step - 1]]
+                changes[:, m] = change_costs(ones, twos, spans_s[step - 1 : step + 1], windows, free)
+        paths = total[:, :, None] + changes
+        back.append(paths.argmin(axis=0))
+        total = paths.min(axis=0) + fits[step + 1][None] + pairs(step)
+    before, last = (int(c) for c in np.unravel_index(int(total.argmin()), total.shape))
+    chosen = [last, before]
+    for came_from in back[::-1]:
+        chosen.append(int(came_from[chosen[-1], chosen[-2]]))
+    return [here[c].pose for here, c in zip(found, chosen[::-1], strict=True)]
 
 
 def with_model(h: Hypothesis, model: ShapeViews) -> Hypothesis:

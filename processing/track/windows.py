@@ -160,16 +160,16 @@ def _linked(scene: Scene, usable: Int[Array, " u"], steps: list[Motions], config
     frames apart and by the change of spin."""
     distance = float(np.median(np.linalg.norm(scene.store.center_m[usable], axis=1)))
     row = rows(config.compared, distance)[0]
-    total = _pair_costs(scene, int(usable[0]), int(usable[1]), steps[0], row)
+    total = pair_costs(scene, int(usable[0]), int(usable[1]), steps[0], row)
     back: list[Int[Array, " m"]] = []
     for a in range(1, len(steps)):
         i, now, j = map(int, usable[a - 1 : a + 2])
         both = [two @ one for one in steps[a - 1] for two in steps[a]]
-        across = _pair_costs(scene, i, j, both, row).reshape(len(steps[a - 1]), -1)
-        ratio = (_changes_deg(steps[a - 1], steps[a], np.diff(scene.times_s[[i, now, j]])) / config.change_deg) ** 2
-        paths = total[:, None] + across + config.impact * ratio / (1 + ratio)
+        across = pair_costs(scene, i, j, both, row).reshape(len(steps[a - 1]), -1)
+        spans_s = np.diff(scene.times_s[[i, now, j]])
+        paths = total[:, None] + across + change_costs(steps[a - 1], steps[a], spans_s, config)
         back.append(np.argmin(paths, axis=0))
-        total = paths.min(axis=0) + _pair_costs(scene, now, j, steps[a], row)
+        total = paths.min(axis=0) + pair_costs(scene, now, j, steps[a], row)
     at = int(np.argmin(total))
     out = [steps[-1][at]]
     for motions, came_from in zip(steps[-2::-1], back[::-1]):
@@ -185,14 +185,27 @@ def _changes_deg(ones: Motions, twos: Motions, spans_s: Float[Array, "2"]) -> Fl
     return np.degrees(np.linalg.norm(gaps, axis=-1))
 
 
-def _pair_costs(scene: Scene, i: int, j: int, motions: Motions, row: Float[Array, "7"]) -> Float[Array, " m"]:
-    """Mean cost of two views, both ways, under each motion from one to the other."""
+def change_costs(
+    ones: Motions, twos: Motions, spans_s: Float[Array, "2"], config: WindowConfig, free: bool = False
+) -> Float[Array, "a b"]:
+    """What the change of spin from each first motion to each second one costs; without a limit where nothing touches
+    the body (`free`)."""
+    ratio = (_changes_deg(ones, twos, spans_s) / config.change_deg) ** 2
+    return config.impact * (ratio if free else ratio / (1 + ratio))
+
+
+def pair_costs(
+    scene: Scene, i: int, j: int, motions: Motions, row: Float[Array, "7"], unseen: float = 0.0
+) -> Float[Array, " m"]:
+    """Mean cost of two views, both ways, under each motion from one to the other; `unseen`: of a point that has no
+    counterpart in the other view."""
     pairs = np.array([[i, j], [j, i]], dtype=np.int64)
     poses = np.zeros((max(i, j) + 1, 4, 4))
     poses[i] = np.eye(4)
     out = np.empty(len(motions))
     for m, poses[j] in enumerate(motions):
-        out[m] = compared(scene.store, poses, pairs, row, shaded=False)[2][:, 0].mean()
+        figures = compared(scene.store, poses, pairs, row, shaded=False)[2]
+        out[m] = (figures[:, 0] + unseen * (1 - figures[:, 1])).mean()
     return out
 
 

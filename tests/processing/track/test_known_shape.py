@@ -9,11 +9,15 @@ import numpy as np
 import pytest
 
 from processing.evaluate.metrics import frame_errors
-from processing.track.known_shape import ShapeConfig
+from processing.features.sift import Sift
+from processing.motion.motion_prior import gravity_in_camera
+from processing.track.beam import Scene, seconds
+from processing.track.known_shape import ShapeConfig, center_of, path_through
 from processing.track.registration.register import register_tosses
-from processing.track.track_toss import TossTrack, TrackConfig, track_toss
+from processing.track.track_toss import TossTrack, TrackConfig, track_toss, views_of
 from recordings.errors import BadInput
-from recordings.geometry import Transform
+from recordings.geometry import Transform, rotation_exp
+from recordings.progress import Silent
 from recordings.records import RgbdFrame
 from recordings.tracks import ObjectShape
 
@@ -71,9 +75,49 @@ def test_a_known_shape_is_found_from_scratch_and_tracked_in_its_own_frame(
 
 def test_a_shape_without_colours_is_followed_by_its_form(tiny_world: Any, toss: Toss) -> None:
     found = followed(tiny_world, toss, model=box_shape(np.array([0.10, 0.08, 0.06]), None))
-    pose, true = found.track.camera_from_object[0], toss[2][0]
-    twin = true[:3, :3].T @ pose[:3, :3]  # a box without colours has four twins, each a half turn away
-    np.testing.assert_allclose(np.abs(np.diag(twin)), 1, atol=0.005)
+    twins = np.einsum("nji,njk->nik", toss[2][:, :3, :3], found.track.camera_from_object[:, :3, :3])
+    np.testing.assert_allclose(np.abs(np.diag(twins[0])), 1, atol=0.005)  # one of four, each a half turn away
+    np.testing.assert_allclose(twins, np.broadcast_to(twins[0], twins.shape), atol=0.08)  # and the same in all frames
+
+
+def tumbling(world: Any) -> Toss:
+    """The toss, but it turns by three quarters of a right angle from each frame to the next."""
+    turn, seen, truth = np.eye(3), [], []
+    step = rotation_exp(np.radians(67.5) * np.array([0.48, -0.6, 0.64]))
+    for i, pose in enumerate(world.poses(COUNT, 0)):
+        turn = step @ turn
+        turned = Transform("world", "object", turn @ pose.matrix[:3, :3], pose.matrix[:3, 3] + [0, 0, 0.05])
+        seen.append(world.see(turned, i))
+        truth.append((world.world_from_camera.inverse() @ turned).matrix)
+    return [f for f, _ in seen], [m for _, m in seen], np.stack(truth)
+
+
+def path_of(world: Any, toss: Toss, shape: ObjectShape) -> np.ndarray:
+    """Poses before any refinement."""
+    sure = np.ones(len(toss[0]))
+    store, times_ns, drawn = views_of(
+        toss[0], toss[1], world.camera, sure, CONFIG, world.world_from_camera, Silent(), model=shape
+    )
+    assert drawn is not None
+    gravity = gravity_in_camera(world.world_from_camera.matrix)
+    scene = Scene(store, seconds(times_ns), gravity, center_of(shape), Sift())
+    return path_through(scene, drawn, CONFIG.beam, CONFIG.windows, CONFIG.shape)
+
+
+def test_on_a_shape_no_frame_rests_on_the_one_before(tiny_world: Any, shape: Any) -> None:
+    toss = tumbling(tiny_world)
+    errors = frame_errors(path_of(tiny_world, toss, shape), toss[2], np.eye(3) * 0.05)
+    assert errors.rotation_deg.max() < 5.0
+    assert errors.translation_m.max() < 0.006
+
+
+def test_a_path_passes_by_frames_that_do_not_show_the_shape(tiny_world: Any, toss: Toss, shape: Any) -> None:
+    empty = [np.zeros_like(m) if i == 3 else m for i, m in enumerate(toss[1])]
+    path = path_of(tiny_world, (toss[0], empty, toss[2]), shape)
+    assert np.flatnonzero(~np.isfinite(path[:, 0, 0])).tolist() == [3]
+    far_off = box_shape(np.array([0.6, 0.5, 0.02]), None)
+    with pytest.raises(BadInput, match="fits nothing that the frames show"):
+        path_of(tiny_world, toss, far_off)
 
 
 def test_given_poses_are_refined_and_unknown_frames_are_found(tiny_world: Any, toss: Toss) -> None:
