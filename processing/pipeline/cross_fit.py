@@ -136,7 +136,7 @@ def _surely_better(
 
 
 def located_on(run: Run, images: Images, shape: Done) -> Done[TrackResult] | None:
-    """One toss tracked on a shape from the start; None where the shape fits none of its frames."""
+    """One toss tracked on a shape from the start; None where the shape fits nothing that its first frame shows."""
     try:
         return track(run, images, shape)
     except BadInput:

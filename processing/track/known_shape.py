@@ -7,7 +7,6 @@ colour in them, and a shape without colours has none anywhere.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -41,7 +40,7 @@ class ShapeConfig:
     tried: int = 32
     """The best of them that are aligned coarsely ..."""
     starts: int = 10
-    """... and of those, the ones that paths may pass through."""
+    """... and of those, the ones that tracking may start from and paths may pass through."""
     spread: float = 0.12
     """One that fits worse than the best by more than this is none."""
     seek: Schedule = ((1, 6, 0.015, 0.6, 0.012, 0.12),)
@@ -159,21 +158,16 @@ def located(scene: Scene, view: int, model: ShapeViews, beam: BeamConfig, config
 
 
 def path_through(
-    scene: Scene, model: ShapeViews, beam: BeamConfig, windows: WindowConfig, config: ShapeConfig,
-    report: Callable[[float], None] = lambda _: None,
-) -> Float[Array, "n 4 4"]:  # fmt: skip
+    scene: Scene, model: ShapeViews, beam: BeamConfig, windows: WindowConfig, config: ShapeConfig
+) -> Float[Array, "n 4 4"]:
     """camera_from_object of a toss's frames on a shape: each is located by itself, and the cheapest path through what
     was found taken (Viterbi) by how the frames fit the shape, what pairs of them say of the motion between them, and
-    its changes. No pose rests on that of the frame before, so that no error is carried on. NaN where nothing fits.
-
-    `report` is told the share of the work that is done. Raises BadInput where the shape fits no frame."""
+    its changes. No pose rests on that of the frame before, so that no error is carried on. NaN where nothing fits."""
     n = len(scene.times_s)
     runs = scene.store.still_runs(np.array([scene.store.usable(i) for i in range(n)]))
-    found = _everywhere(scene, [run[len(run) // 2] for run in runs], model, beam, config, report)
+    found = _everywhere(scene, [run[len(run) // 2] for run in runs], model, beam, config)
     runs = [run for run, here in zip(runs, found, strict=True) if here]
     found = [here for here in found if here]
-    if not runs:
-        raise BadInput("the given shape fits nothing that the frames show; is it a shape of this object?")
     poses = np.full((n, 4, 4), np.nan)
     for run, pose in zip(runs, _cheapest(scene, runs, found, windows, config), strict=True):
         poses[run] = pose
@@ -181,9 +175,8 @@ def path_through(
 
 
 def _everywhere(
-    scene: Scene, views: list[int], model: ShapeViews, beam: BeamConfig, config: ShapeConfig,
-    report: Callable[[float], None],
-) -> list[list[Candidate]]:  # fmt: skip
+    scene: Scene, views: list[int], model: ShapeViews, beam: BeamConfig, config: ShapeConfig
+) -> list[list[Candidate]]:
     """Poses of each of these frames at which it fits the shape: found there, or beside it and carried on, forward and
     then backward."""
     n = len(scene.times_s)
@@ -191,8 +184,7 @@ def _everywhere(
     poses = np.concatenate([np.full((n, 4, 4), np.nan), model.poses])
     searched = np.linspace(0, len(views) - 1, min(config.searched, len(views))).astype(int)
     found: list[list[Candidate]] = [[] for _ in views]
-    for done, place in enumerate(searched):
-        report(done / len(searched))
+    for place in searched:
         found[place] = located(scene, views[place], model, beam, config)
 
     def carry(one: int, other: int) -> None:
@@ -220,8 +212,8 @@ def _cheapest(
     scene: Scene, runs: list[list[int]], found: list[list[Candidate]], windows: WindowConfig, config: ShapeConfig
 ) -> list[Float[Array, "4 4"]]:
     """One pose of each run of frames."""
-    if len(runs) == 1:
-        return [found[0][0].pose]
+    if len(runs) < 2:
+        return [here[0].pose for here in found]
     distance_m = float(np.median(np.linalg.norm(scene.store.center_m[[run[0] for run in runs]], axis=1)))
     row = rows(windows.compared, distance_m)[0]
     fits = [len(run) * np.array([c.fit for c in here]) for run, here in zip(runs, found, strict=True)]

@@ -42,7 +42,15 @@ from processing.track.hypotheses import (
     select,
 )
 from processing.track.keyframes import extended
-from processing.track.known_shape import ShapeConfig, ShapeViews, center_of, path_through, shape_views, with_model
+from processing.track.known_shape import (
+    ShapeConfig,
+    ShapeViews,
+    center_of,
+    located,
+    path_through,
+    shape_views,
+    with_model,
+)
 from processing.track.windows import WindowConfig, through_windows
 from recordings.errors import BadInput
 from recordings.geometry import CameraModel, Transform
@@ -142,7 +150,7 @@ def track_toss(
     The object frame is parallel to the camera at the first usable frame, its origin at the center of the cloud seen
     there; or `start` gives camera_from_object of frame `start_frame` (None: the first usable one), which is kept.
     `poses` (NaN where unknown) are refined, only unknown frames are sought. With `model` the object frame is the
-    model's: the object is located anew in every frame (or starts from `start` or `poses`), then tracked against
+    model's: the object is located anew in the first frame (or starts from `start` or `poses`), then tracked against
     the model's surface and colours and what the frames themselves show.
     Raises BadInput where no frame shows enough of the object, or where what is given does not fit together.
     """
@@ -160,13 +168,6 @@ def track_toss(
     scene = Scene(store, seconds(times_ns), gravity, center_m, matcher or Sift(), hand=hand)
     n = len(frames)
     scene = replace(scene, flying=np.isin(np.arange(n), flying(scene, n, config.flight)))
-    if known.model is not None and known.start is None and known.poses is None:
-        poses = path_through(
-            scene, known.model, config.beam, config.windows, config.shape,
-            lambda share: progress.step(n + int(share * n), 3 * n, "frames on the shape"),
-        )  # fmt: skip
-        known = replace(known, poses=poses)
-        first = _first(store, known, n, toss, config)
     if known.poses is None:
         hypotheses, rejected = _followed(scene, first, known, config, progress)
     else:
@@ -174,11 +175,11 @@ def track_toss(
         hypotheses = [hypothesis]
     keep_first = model is None or known.start is not None
     found = all_refined(scene, hypotheses, first, keep_first, config.hypotheses)
-    found += through_windows(
-        scene, first, found, config.beam.keyframes, config.windows, config.hypotheses,
-        lambda share: progress.step(2 * n + int(share * n), 3 * n, "windows"),
-    )  # fmt: skip
     if known.poses is None and known.model is None:
+        found += through_windows(
+            scene, first, found, config.beam.keyframes, config.windows, config.hypotheses,
+            lambda share: progress.step(2 * n + int(share * n), 3 * n, "windows"),
+        )  # fmt: skip
         found += crossed(
             scene, first, sorted(found, key=lambda h: h.cost), config.crossover, config.hypotheses,
             lambda share: progress.step(2 * n + int(share * n), 3 * n, "crossovers"),
@@ -280,16 +281,15 @@ def _followed(
 ) -> tuple[list[Hypothesis], dict[int, list[Candidate]]]:
     """Hypotheses of the same frames: the beam forward, then once more backward to the first frame with all that forward
     learned as the model; a beam backward that knows nothing of that but where the last frame is; and the beam forward
-    itself, where both differ from it. Where they leave its flight open, that solved as one adds its own."""
+    itself, where both differ from it. Where they leave its flight open, that solved as one adds its own. On a known
+    shape, which tells where each frame is by itself, the path through these."""
     n = len(scene.times_s)
-    pose = first_pose(scene.store, first) if known.start is None else known.start
-    beam = started(scene.store, n, first, pose)
-    beam = beam if known.model is None else with_model(beam, known.model)
+    beam, wide = _starts(scene, first, known, config)
     ahead = np.arange(first + 1, n)
-    best, rejected = follow(scene, ahead, [beam], config.beam, lambda i, _: progress.step(n + i, 3 * n, "forward"))
+    best, rejected = follow(scene, ahead, beam, wide, lambda i, _: progress.step(n + i, 3 * n, "forward"))
     last = best.tracked[-1]
     all_done = replace(best, done=(last,), total=0.0)
-    stop = first if known.model is not None else first - 1
+    stop = first if known.model is not None and known.start is not None else first - 1
     narrow, starts = replace(config.beam, width=2), [all_done]
     if known.model is None and last > first + 1:
         starts.append(started(scene.store, n, last, best.poses[last]))
@@ -306,6 +306,10 @@ def _followed(
             done = (*(i for i in hypothesis.done if i != first), first)
             hypothesis = follow(scene, np.arange(first - 1, -1, -1), [replace(hypothesis, done=done)], narrow)[0]
         out.append(replace(hypothesis, done=tuple(range(n)), total=best.total))
+    if known.model is not None and known.start is None:
+        progress.step(2 * n, 3 * n, "frames on the shape")
+        path = path_through(scene, known.model, config.beam, config.windows, config.shape)
+        out.append(with_model(replace(best, poses=path, done=tuple(range(n)), keyframes=(first,)), known.model))
     return out, rejected
 
 
@@ -321,6 +325,21 @@ def _through_flights(
         if np.isfinite(h.poses[first, 0, 0])
         and all(apart_deg(h.poses[:n], s.poses[:n]) > config.separate_deg for s in others)
     ]
+
+
+def _starts(scene: Scene, first: int, known: _Known, config: TrackConfig) -> tuple[list[Hypothesis], BeamConfig]:
+    """The hypotheses that tracking starts from, and how many are carried."""
+    n = len(scene.times_s)
+    if known.model is None:
+        pose = first_pose(scene.store, first) if known.start is None else known.start
+        return [started(scene.store, n, first, pose)], config.beam
+    if known.start is not None:
+        return [with_model(started(scene.store, n, first, known.start), known.model)], config.beam
+    found = located(scene, first, known.model, config.beam, config.shape)
+    if not found:
+        raise BadInput("the given shape fits nothing that the first frame shows; is it a shape of this object?")
+    beam = [replace(with_model(started(scene.store, n, first, c.pose), known.model), total=c.fit) for c in found]
+    return beam, replace(config.beam, width=max(config.beam.width, config.shape.starts))
 
 
 def _filled_in(
