@@ -309,7 +309,7 @@ def _followed(
     if known.model is not None and known.start is None:
         progress.step(2 * n, 3 * n, "frames on the shape")
         path = path_through(scene, known.model, config.beam, config.windows, config.shape)
-        out.append(with_model(replace(best, poses=path, done=tuple(range(n)), keyframes=(first,)), known.model))
+        out += [_filled_in(scene, replace(known, poses=path), config, progress)[0]] if np.isfinite(path).any() else []
     return out, rejected
 
 
