@@ -1,4 +1,4 @@
-"""Where the body's center of mass is, from its free flight."""
+"""Where the body's center of mass is: a first guess by what one view shows, then from its free flight."""
 
 from __future__ import annotations
 
@@ -6,8 +6,23 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray as Array
 
+from processing.sensor import view_layout as lay
+from processing.sensor.view_store import ViewStore
 from processing.track.beam import Scene
 from processing.track.joint_refinement import Motion, motion_residual
+
+
+def first_center_m(store: ViewStore, view: int, pose: Float[Array, "4 4"] | None) -> Float[Array, "3"]:
+    """A first guess, object frame: behind the center of the cloud that a view shows by a third of its width. `pose`:
+    the view's camera_from_object; None: parallel to the camera, at the cloud's center."""
+    first, count = int(store.table[view, lay.FIRST]), int(store.table[view, lay.COUNT])
+    points = store.samples[first : first + count, :3].astype(np.float64)
+    center_m = points.mean(0)
+    width = float(np.ptp(points[:, :2], axis=0).mean())
+    behind = np.asarray(center_m / np.linalg.norm(center_m) * width * 0.3)
+    if pose is None:
+        return behind
+    return np.asarray(pose[:3, :3].T @ (center_m + behind - pose[:3, 3]))
 
 
 def center_of_mass(poses: Float[Array, "n 4 4"], use: Bool[Array, " n"], scene: Scene) -> Float[Array, "3"]:

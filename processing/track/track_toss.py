@@ -20,6 +20,7 @@ from processing.sensor.rectification import Rectification
 from processing.sensor.view import Crop, ViewConfig, cut
 from processing.sensor.view_store import ViewStore
 from processing.track.beam import BeamConfig, Candidate, Hypothesis, Scene, follow, seconds, started
+from processing.track.center_of_mass import first_center_m
 from processing.track.crossover import CrossoverConfig, crossed
 from processing.track.depth_color_offset import unknown_motion
 from processing.track.flags import (
@@ -164,7 +165,8 @@ def track_toss(
     known = _known(start, start_frame, poses, drawn, len(frames))
     first = _first(store, known, len(frames), toss, config)
     gravity = gravity_in_camera(None if world_from_camera is None else world_from_camera.matrix)
-    center_m = _first_center_m(store, first, known) if model is None else center_of(model)
+    given = known.start if known.poses is None else known.poses[first]
+    center_m = first_center_m(store, first, given) if model is None else center_of(model)
     scene = Scene(store, seconds(times_ns), gravity, center_m, matcher or Sift(), hand=hand)
     n = len(frames)
     scene = replace(scene, flying=np.isin(np.arange(n), flying(scene, n, config.flight)))
@@ -263,19 +265,6 @@ def first_pose(store: ViewStore, view: int) -> Float[Array, "4 4"]:
     return pose
 
 
-def _first_center_m(store: ViewStore, view: int, known: _Known) -> Float[Array, "3"]:
-    """A first guess of the center of mass in the object frame: behind the cloud's center by a third of its width."""
-    first, count = int(store.table[view, lay.FIRST]), int(store.table[view, lay.COUNT])
-    points = store.samples[first : first + count, :3].astype(np.float64)
-    center_m = points.mean(0)
-    width = float(np.ptp(points[:, :2], axis=0).mean())
-    behind = np.asarray(center_m / np.linalg.norm(center_m) * width * 0.3)
-    pose = known.start if known.poses is None else known.poses[view]
-    if pose is None:
-        return behind
-    return np.asarray(pose[:3, :3].T @ (center_m + behind - pose[:3, 3]))
-
-
 def _followed(
     scene: Scene, first: int, known: _Known, config: TrackConfig, progress: Progress
 ) -> tuple[list[Hypothesis], dict[int, list[Candidate]]]:
@@ -307,9 +296,11 @@ def _followed(
             hypothesis = follow(scene, np.arange(first - 1, -1, -1), [replace(hypothesis, done=done)], narrow)[0]
         out.append(replace(hypothesis, done=tuple(range(n)), total=best.total))
     if known.model is not None and known.start is None:
-        progress.step(2 * n, 3 * n, "frames on the shape")
-        path = path_through(scene, known.model, config.beam, config.windows, config.shape)
-        out += [_filled_in(scene, replace(known, poses=path), config, progress)[0]] if np.isfinite(path).any() else []
+        path = path_through(
+            scene, known.model, config.beam, config.windows, config.shape,
+            lambda share: progress.step(2 * n + int(share * n), 3 * n, "frames on the shape"),
+        )  # fmt: skip
+        out += [_filled_in(scene, replace(known, poses=path), config, Silent())[0]] if np.isfinite(path).any() else []
     return out, rejected
 
 

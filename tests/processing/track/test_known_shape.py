@@ -12,9 +12,11 @@ from processing.evaluate.metrics import frame_errors
 from processing.features.sift import Sift
 from processing.motion.motion_prior import gravity_in_camera
 from processing.track.beam import Scene, seconds
-from processing.track.known_shape import ShapeConfig, center_of, path_through
+from processing.track.known_shape import ShapeConfig, ShapeViews, center_of, path_through
 from processing.track.registration.register import register_tosses
+from processing.track.schedule import rows
 from processing.track.track_toss import TossTrack, TrackConfig, track_toss, views_of
+from processing.track.windows import pair_costs
 from recordings.errors import BadInput
 from recordings.geometry import Transform, rotation_exp
 from recordings.progress import Silent
@@ -92,16 +94,32 @@ def tumbling(world: Any) -> Toss:
     return [f for f, _ in seen], [m for _, m in seen], np.stack(truth)
 
 
-def path_of(world: Any, toss: Toss, shape: ObjectShape) -> np.ndarray:
-    """Poses before any refinement."""
+def scene_of(world: Any, toss: Toss, shape: ObjectShape) -> tuple[Scene, ShapeViews]:
     sure = np.ones(len(toss[0]))
     store, times_ns, drawn = views_of(
         toss[0], toss[1], world.camera, sure, CONFIG, world.world_from_camera, Silent(), model=shape
     )
     assert drawn is not None
     gravity = gravity_in_camera(world.world_from_camera.matrix)
-    scene = Scene(store, seconds(times_ns), gravity, center_of(shape), Sift())
+    return Scene(store, seconds(times_ns), gravity, center_of(shape), Sift()), drawn
+
+
+def path_of(world: Any, toss: Toss, shape: ObjectShape) -> np.ndarray:
+    """Poses before any refinement."""
+    scene, drawn = scene_of(world, toss, shape)
     return path_through(scene, drawn, CONFIG.beam, CONFIG.windows, CONFIG.shape)
+
+
+def test_a_turn_after_which_nothing_can_be_compared_is_not_free(tiny_world: Any, toss: Toss, shape: Any) -> None:
+    scene, _ = scene_of(tiny_world, toss, shape)
+    one, two = toss[2][:2]
+    behind = one.copy()
+    behind[:3, :3] = rotation_exp(np.array([0, np.pi, 0])) @ one[:3, :3]  # about an axis across the line of sight
+    motions = [pose @ np.linalg.inv(one) for pose in (two, behind)]
+    row = rows(CONFIG.windows.compared, 0.6)[0]
+    price = pair_costs(scene, 0, 1, motions, row, CONFIG.shape.unseen) - pair_costs(scene, 0, 1, motions, row)
+    assert price[0] < 0.2 * CONFIG.shape.unseen  # nearly all points of one view are seen in the other
+    assert price[1] == pytest.approx(CONFIG.shape.unseen)  # and none once it has turned its back
 
 
 def test_on_a_shape_no_frame_rests_on_the_one_before(tiny_world: Any, shape: Any) -> None:
