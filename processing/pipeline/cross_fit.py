@@ -8,10 +8,12 @@ agree with their own fusion at the poses: a wrong pose blurs the surface, and th
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray as Array
+from scipy.special import ndtri
 
 from processing.images import Images
 from processing.refine.image_residuals import FAR_M, Explained, difference
@@ -26,10 +28,13 @@ from recordings.errors import BadInput
 TURNS, GAIN = 6, 0.1
 """A further turn is for tosses whose misfit fell by more than this in the last one, and the second for those that the
 first left open, too: on shapes that it corrected."""
-HALF_SQUARES = 9.0
-"""In a pair's cost of one: a residual of three scales, whose half square is 4.5, costs a half (`pair_terms`)."""
-FAR_BETTER = float(np.log(2.0))
-"""Nats a frame: half the residuals. A toss that lies right on a shape fits hardly worse than it does alone."""
+ALIKE = 0.1
+"""Standard deviation by which the logarithms of residuals differ where nothing does: a plain box in its four ways of
+lying (choose-000) has .03 to .14 (shading, tint, the shape's own errors), which more frames do not average out."""
+SURE_NATS = 0.5 * float(ndtri(0.95)) ** 2
+"""What chance makes of a Gaussian once in twenty times (one side)."""
+FAR_BETTER = 0.5 * float(np.log(2.0) / ALIKE) ** 2
+"""Nats of half the residuals: a toss that lies right on a shape fits hardly worse than it does alone."""
 FOLDS = 3
 """Into so many parts many tosses are split, each tracked on the others' shape; fewer tosses are left out singly."""
 
@@ -103,8 +108,8 @@ def worst_first(misfits: Mapping[int, float]) -> list[tuple[int, ...]]:
 
 def chosen(run: Run, before: Done, known: TrackResult, shape: Done, images: Images) -> Done:
     """Of one toss: the track that it had (of which is `known` what it cost) or that refined on a shape, whichever fits
-    itself better; or, where it is open, the object located anew on that, where it fits better by more than chance: the
-    frames have to tell another way of lying, and pairs of them must not contradict it."""
+    itself better; or, where it is open, the object located anew on that, where its frames speak for this by more than
+    chance: what they show together, what the shape shows of them, and what pairs of them have in common."""
     ways: dict[str, Callable[[], Done[TrackResult] | None]]
     ways = {"refined": lambda: track(run, images, shape, before=before)}
     ways |= {"anew": lambda: located_on(run, images, shape)} if is_open(run, known) else {}
@@ -112,27 +117,45 @@ def chosen(run: Run, before: Done, known: TrackResult, shape: Done, images: Imag
     found: dict[str, Done] = {"before": before, **tried}
     seen = each(run, found, lambda way: on_itself(run, found[way], images))
     best = min((way for way in found if way != "anew"), key=lambda way: misfit(seen[way]))
-    if "anew" in found and misfit(seen["anew"]) < misfit(seen[best]):
-        costs = {"before": known.cost, **{way: done.result.cost for way, done in tried.items()}}
-        best = "anew" if _surely_better(seen["anew"], seen[best], costs["anew"], costs[best]) else best
-    return found[best]
+    if "anew" not in found:
+        return found[best]
+    on_it = each(run, ("refined", "anew"), lambda way: on_shape(run, found[way], shape, images))
+    costs = {"before": known.cost, **{way: done.result.cost for way, done in tried.items()}}
+    stays = Evidence(seen[best], costs[best], on_it["refined"])  # before it was refined, it was not yet on the shape
+    return found["anew" if Evidence(seen["anew"], costs["anew"], on_it["anew"]).surely_better(stays) else best]
 
 
 def sure_alone(run: Run, images: Images, alone: Done[TrackResult], anew: Done[TrackResult]) -> bool:
-    """Whether a toss's own track fits its frames far better than the object located on a shape: by `FAR_BETTER`, and
-    that by more than chance."""
-    seen = on_itself(run, alone, images), on_itself(run, anew, images)
-    return _surely_better(*seen, alone.result.cost, anew.result.cost, FAR_BETTER)
+    """Whether a toss's own track fits its frames far better than the object located on a shape: by `FAR_BETTER`."""
+    own, there = (Evidence(on_itself(run, done, images), done.result.cost) for done in (alone, anew))
+    return own.surely_better(there, FAR_BETTER)
 
 
-def _surely_better(
-    one: Explained, other: Explained, cost: float | None, other_cost: float | None, least: float = 0.0
-) -> bool:
-    """Whether frames fit one way of lying better than another by `least` and more than chance, with what their pairs
-    say (unless it is not known of both), in nats a frame."""
-    gap = difference(one, other, misfit_of)
-    pairs = 0.0 if cost is None or other_cost is None else HALF_SQUARES * (other_cost - cost)
-    return gap.mean + pairs > gap.by_chance + least
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """What speaks for a track: how its frames agree with their own fusion, what their pairs cost (None: unknown), and
+    how they agree with the shape of the others (None: it does not lie on that)."""
+
+    own: Explained
+    cost: float | None
+    on_others: Explained | None = None
+
+    def surely_better(self, other: Evidence, least: float = SURE_NATS) -> bool:
+        """Whether all of it together prefers this track by more than `least` nats."""
+        judged = [(self.own, other.own)]
+        if self.on_others is not None and other.on_others is not None:
+            judged.append((self.on_others, other.on_others))
+        gaps = [difference(*both, value) for both in judged for value in (misfit_of, chroma_of)]
+        nats = [preferred(gap.mean, gap.error) for gap in gaps if gap.frames]
+        if self.cost and other.cost:
+            nats.append(preferred(float(np.log(other.cost / self.cost)), 0.0))
+        return self.own.lost <= other.own.lost and sum(nats) > least
+
+
+def preferred(gap: float, error: float) -> float:
+    """Logarithm of the likelihood ratio that a gap between two residuals' logarithms (with its standard error) speaks
+    with for the first (negative: against it), where gaps of `ALIKE` mean nothing."""
+    return float(0.5 * np.sign(gap) * gap**2 / (error**2 + ALIKE**2))
 
 
 def located_on(run: Run, images: Images, shape: Done) -> Done[TrackResult] | None:
@@ -158,8 +181,14 @@ def on_itself(run: Run, done: Done, images: Images) -> Explained:
     toss, own = images.toss, {images.toss: images}
     shape = fused(run, {toss: done}, own, draft=True)
     if shape is None:
-        return Explained(np.zeros((0, 5)), 1)
+        return Explained(np.zeros((0, 6)), 1)
     return residuals(judge(run, f"toss {toss} on itself", {toss: done}, {toss: shape}, own))
+
+
+def on_shape(run: Run, done: Done, shape: Done, images: Images) -> Explained:
+    """The residuals of a toss's raw images against a shape at a track's poses."""
+    toss = images.toss
+    return residuals(judge(run, f"toss {toss} on the others", {toss: done}, {toss: shape}, {toss: images}))
 
 
 def misfit(seen: Explained) -> float:
@@ -168,7 +197,12 @@ def misfit(seen: Explained) -> float:
     return float(np.mean(each_frame)) if each_frame else float("inf")
 
 
-def misfit_of(row: Float[Array, "5"]) -> float:
+def misfit_of(row: Float[Array, "6"]) -> float:
     """Of a frame: the logarithm of depth's residual (m) times the outline's (1 - IoU). Its colours are left out: a body
     that is thought not to turn keeps the shading that stays with the room."""
     return float(np.log(max(row[2], 1e-6)) + np.log(max(row[3], 1e-6)))
+
+
+def chroma_of(row: Float[Array, "6"]) -> float:
+    """Of a frame: the logarithm of the chromaticity's residual; NaN where too little of it has colours."""
+    return float(np.log(max(row[5], 1e-6)))

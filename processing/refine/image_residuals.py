@@ -55,9 +55,9 @@ class MeanResiduals:
 
 @dataclass(frozen=True, eq=False)
 class Explained:
-    """Residuals of single frames by position: rows (toss, position, depth_m, mask, color)."""
+    """Residuals of single frames by position: rows (toss, position, depth_m, mask, color, chroma)."""
 
-    rows: Float[Array, "n 5"]
+    rows: Float[Array, "n 6"]
     lost: int
 
     def means(self) -> MeanResiduals:
@@ -95,13 +95,13 @@ class Difference:
         return f"{1e3 * self.mean:+.3f} mm, standard error {1e3 * self.error:.3f} mm, {self.frames} frames"
 
 
-def depth_of(row: Float[Array, "5"]) -> float:
+def depth_of(row: Float[Array, "6"]) -> float:
     """Of a frame's residuals that of depth (m)."""
     return float(row[2])
 
 
 def difference(
-    first: Explained, second: Explained, value: Callable[[Float[Array, "5"]], float] = depth_of
+    first: Explained, second: Explained, value: Callable[[Float[Array, "6"]], float] = depth_of
 ) -> Difference:
     """Residuals (a `value` of each frame's row) of two shapes or poses compared frame by frame: what is hard to see in
     a frame (its noise, its outline) is in both, and cancels.
@@ -109,7 +109,7 @@ def difference(
     Neighbouring frames see the same faces: with r their correlation, n of them are worth n (1 - r) / (1 + r).
     """
     a, b = ({(int(r[0]), int(r[1])): value(r) for r in rows} for rows in (first.rows, second.rows))
-    both = [place for place in a if place in b]
+    both = [place for place in a if place in b and np.isfinite(a[place] + b[place])]
     if not both:
         return Difference(float("nan"), float("nan"), 0, 0.0)
     gaps, toss = np.array([b[p] - a[p] for p in both]), np.array([p[0] for p in both])
@@ -154,8 +154,9 @@ def explain(
         if not np.isfinite(depth):
             continue
         both = inside & seen
-        rows.append((track.toss, i, depth, 1 - float((seen & mask).sum()) / union, _color(frame, drawn, both)))
-    return Explained(np.array(rows, dtype=np.float64).reshape(-1, 5), lost)
+        colors = _color(frame, drawn, both), _chroma(frame, drawn, both)
+        rows.append((track.toss, i, depth, 1 - float((seen & mask).sum()) / union, *colors))
+    return Explained(np.array(rows, dtype=np.float64).reshape(-1, 6), lost)
 
 
 def pooled(parts: Sequence[Explained]) -> Explained:
@@ -168,7 +169,7 @@ def _color(frame: RgbdFrame, drawn: Drawn, both: Bool[Array, "h w"]) -> float:
 
     Faces are lit by where they point to (Lambert, and light from everywhere): grey = albedo * (a + b . n) + c.
     """
-    if drawn.rgb is None or both.sum() < 50:
+    if drawn.rgb is None or both.sum() < LEAST_COLORED:
         return float("nan")
     albedo = drawn.rgb[both].astype(np.float64).mean(-1)
     taken = frame.color_rgb[both].astype(np.float64).mean(-1)
@@ -177,6 +178,25 @@ def _color(frame: RgbdFrame, drawn: Drawn, both: Bool[Array, "h w"]) -> float:
     return float(np.median(np.abs(taken - terms @ light)))
 
 
+def _chroma(frame: RgbdFrame, drawn: Drawn, both: Bool[Array, "h w"]) -> float:
+    """Mean absolute difference of chromaticity, which shading leaves as it is, but for the frame's own tint."""
+    if drawn.rgb is None or both.sum() < LEAST_COLORED:
+        return float("nan")
+    albedo, taken = (chromaticity(rgb[both]) for rgb in (drawn.rgb, frame.color_rgb))
+    gap = taken - albedo
+    return float(np.abs(gap - np.median(gap, axis=0)).mean())
+
+
+def chromaticity(rgb: UInt8[Array, "n 3"]) -> Float[Array, "n 3"]:
+    """Channels over brightness (no unit, 1 is grey); what is darker than `DARK` has less and less of it."""
+    values = rgb.astype(np.float64)
+    return values / (values.mean(-1, keepdims=True) + DARK)
+
+
+DARK = 8.0
+"""Grey levels of 255: noise and JPEG's steps of a dark pixel."""
+LEAST_COLORED = 50
+"""Pixels without which a frame's light or tint is not solved for."""
 LIGHT_RCOND = 1e-3
 """Of the light's terms: with one face in view, what its direction adds cannot be told from what all light adds."""
 

@@ -17,7 +17,7 @@ from recordings.results.folder import read_shape, read_track
 from recordings.results.stage_files import stage_arrays
 from recordings.whole_file import write_json
 
-VERSION = 4
+VERSION = 5
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from processing.track.track_toss import TossTrack
 from recordings.results.folder import write_track
 from recordings.tracks import ObjectTrack
 
-VERSION = 11
+VERSION = 12
 
 
 @dataclass(frozen=True)

@@ -30,11 +30,11 @@ OPEN = TrackResult(frames=8, interpolated=8, lost=0, cost=0.1)
 TURN = np.array([0.0, 0.0, np.radians(10)])
 
 
-def seen(depth_mm: Any, frames: int = 10) -> Explained:
+def seen(depth_mm: Any, frames: int = 10, chroma: Any = np.nan) -> Explained:
     """Residuals of frames whose outlines fit alike."""
     depth_m = 1e-3 * np.broadcast_to(np.asarray(depth_mm, dtype=np.float64), frames)
-    index = np.arange(frames, dtype=np.float64)
-    return Explained(np.stack([0 * index, index, depth_m, np.full(frames, 0.1), np.full(frames, np.nan)], 1), 0)
+    index, chroma = np.arange(frames, dtype=np.float64), np.broadcast_to(chroma, frames)
+    return Explained(np.stack([0 * index, index, depth_m, np.full(frames, 0.1), np.full(frames, np.nan), chroma], 1), 0)
 
 
 class Tosses:
@@ -213,6 +213,7 @@ class Tried:
 
         monkeypatch.setattr(cross_fit, "track", track)
         monkeypatch.setattr(cross_fit, "on_itself", lambda _, done, __: seen(depth_mm[done.key]))
+        monkeypatch.setattr(cross_fit, "on_shape", lambda *_: seen(2.0))
         self.before, self.shape = (Done(folder, name, None, False) for name in ("before", "shape"))
 
 
@@ -244,6 +245,20 @@ def test_pairs_of_frames_may_contradict_what_the_surface_prefers(
     """A surface prefers the object anew by log(2) nats a frame."""
     tosses = Tosses(tiny_world, tmp_path, 1)
     tried = Tried(monkeypatch, tmp_path, cost, before=3.0, refined=2.0, anew=1.0)
+    assert cross_fit.chosen(tosses.run, tried.before, OPEN, tried.shape, tosses.images[0]).key == taken
+
+
+@pytest.mark.parametrize(("anew", "taken"), [((2.0, 0.01), "anew"), ((2.0, 0.03), "refined"), ((1.0, 0.02), "anew")])
+def test_of_ways_that_fit_themselves_alike_the_others_shape_and_its_colors_tell(
+    anew: tuple[float, float], taken: str, monkeypatch: pytest.MonkeyPatch, tiny_world: Any, tmp_path: Path
+) -> None:
+    """A can fits itself at any azimuth."""
+    tosses = Tosses(tiny_world, tmp_path, 1)
+    tried = Tried(monkeypatch, tmp_path, before=3.0, refined=2.0, anew=2.0)
+    on_others = {"refined": (2.0, 0.02), "anew": anew}
+    monkeypatch.setattr(
+        cross_fit, "on_shape", lambda _, done, *__: seen(on_others[done.key][0], 10, on_others[done.key][1])
+    )
     assert cross_fit.chosen(tosses.run, tried.before, OPEN, tried.shape, tosses.images[0]).key == taken
 
 

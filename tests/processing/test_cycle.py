@@ -150,6 +150,29 @@ def test_colours_are_compared_after_the_light_on_each_face(tiny_world: Any) -> N
     assert len(np.unique(lit[drawn.depth_m > 0].round())) > 1
 
 
+def test_chromaticity_is_left_by_the_light_and_its_tint_and_tells_print(tiny_world: Any) -> None:
+    pose = tiny_world.poses(4)[1]
+    frame, mask = tiny_world.see(pose, 1)
+    camera_from_object = (tiny_world.world_from_camera.inverse() @ pose).matrix
+    box = box_shape()
+    printed = np.random.default_rng(0).integers(40, 220, box.vertices_m.shape).astype(np.uint8)
+    shape = replace(box, vertex_rgb=printed)
+    drawn = ShapeDrawer(shape, tiny_world.camera).draw(camera_from_object)
+    assert drawn.rgb is not None
+    light = (0.7 + 0.3 * drawn.normal @ np.array([0.3, -0.2, 0.4]))[..., None] * np.array([1.0, 0.97, 0.92])
+
+    def chroma(rgb: np.ndarray) -> float:
+        shown = replace(frame, color_rgb=np.clip(light * rgb, 0, 255).astype(np.uint8))
+        track = track_of(camera_from_object[None])
+        return float(explain(shape, track, [shown], [mask], tiny_world.camera, JudgeConfig(every=1)).rows[0, 5])
+
+    own, others = chroma(drawn.rgb), chroma(drawn.rgb[..., [1, 2, 0]])
+    assert own < 0.03 < 0.2 < others
+    plain = replace(box, vertex_rgb=None)
+    assert np.isnan(explain(plain, track_of(camera_from_object[None]), [frame], [mask], tiny_world.camera,
+                            JudgeConfig(every=1)).rows[0, 5])  # fmt: skip
+
+
 def test_a_lost_frame_counts_as_lost_and_never_as_explained(tiny_world: Any) -> None:
     world_poses = tiny_world.poses(4)
     seen = [tiny_world.see(p, i) for i, p in enumerate(world_poses)]

@@ -60,7 +60,7 @@ def rows(depth_m: Any, tosses: int = 1) -> Explained:
     """Residuals of frames spread evenly over tosses."""
     n = len(depth_m)
     toss, nothing = np.repeat(np.arange(tosses), n // tosses), np.zeros(n)
-    return Explained(np.column_stack([toss, 4 * np.arange(n), depth_m, nothing, nothing]), 0)
+    return Explained(np.column_stack([toss, 4 * np.arange(n), depth_m, nothing, nothing, nothing]), 0)
 
 
 def test_a_shape_that_fits_worse_in_every_frame_is_worse_however_noisy_the_frames_are() -> None:
@@ -111,7 +111,7 @@ def test_only_frames_that_both_know_are_compared() -> None:
     second.rows[2, 1], second.rows[2, 2] = 99, 1.0
     gap = difference(first, second)
     assert (gap.frames, gap.mean) == (5, 0.0)
-    nothing = difference(first, Explained(np.zeros((0, 5)), 6))
+    nothing = difference(first, Explained(np.zeros((0, 6)), 6))
     assert nothing.frames == 0
     assert not nothing.worse
 

@@ -327,14 +327,19 @@ def _some_appearance(store: ViewStore, views: Int[Array, " a"], random: np.rando
 
 
 def _against(appearance: float, itself: float, unlike: float) -> float:
-    """How far appearance speaks against a placement: its cost above that at which agreement is as likely as chance.
+    """How far appearance speaks against a placement: the logarithm of the ratio of the likelihoods of "any two points"
+    and "the same point", in the cost's unit.
 
-    For appearance that errs with variance n and varies over the object with s, the likelihoods of "the same point" and
-    of "any two points" are equal at a cost of n ln(s / n) s / (s - n). Between tosses the light differs: n is twice
-    what the views of one toss err. The less the object's appearance varies, the less it says.
+    For appearance that errs with variance n and varies over the object with s, a point whose square is a has
+    (a / n - a / s - ln(s / n)) / 2 nats. Between tosses the light differs: n is twice what the views of one toss err.
+    The less the object's appearance varies, the less it says.
     """
     noise = 2.0 * itself + 0.001
     ratio = unlike / noise
     if ratio <= 1.0:
         return 0.0
-    return (appearance - noise * float(np.log(ratio)) * ratio / (ratio - 1.0)) * (1.0 - 1.0 / ratio)
+    return float((appearance / noise * (1.0 - 1.0 / ratio) - np.log(ratio)) / (2.0 * FULL_NATS))
+
+
+FULL_NATS = 4.5
+"""What a full inconsistency, a residual of three standard deviations, costs in nats: its half square."""

@@ -132,9 +132,10 @@ def _keyframes_from_all_sides(toss: TossTrack, count: int) -> Int[Array, " m"]:
 
 
 def _usable(toss: TossTrack) -> Int[Array, " m"]:
-    """Tracked frames with something to see."""
-    status = toss.track.status
-    return np.array([i for i in range(len(status)) if status[i] == "tracked" and toss.store.usable(i)], dtype=np.int64)
+    """Frames that have a pose and something to see: one that is not sure may be off by some degrees from the first
+    one, but shows a side that the sure ones, often all of them in the hand, do not."""
+    posed = ~toss.track.lost
+    return np.array([i for i in np.flatnonzero(posed) if toss.store.usable(int(i))], dtype=np.int64)
 
 
 def _surface_center_m(store: ViewStore, views: Int[Array, " a"], poses: Float[Array, "n 4 4"]) -> Float[Array, "3"]:

@@ -32,7 +32,8 @@ from processing.track.center_of_mass import flight_center
 from processing.track.flags import camera_covariance
 from processing.track.joint_refinement import GraphConfig, Motion, _add_motion, refine
 from processing.track.keyframes import KeyframeConfig, references
-from processing.track.registration.register import register_tosses
+from processing.track.registration.keyframe_database import keyframes_of
+from processing.track.registration.register import RegisterConfig, register_tosses
 from processing.track.revolution.axis import Axis
 from processing.track.track_file import read_toss_track, write_toss_track
 from processing.track.track_toss import TossTrack, TrackConfig, track_toss
@@ -369,6 +370,16 @@ def test_views_that_no_pair_ties_to_others_stay_and_nothing_is_known_of_them(tra
     np.testing.assert_array_equal(found.poses, poses)
     assert not found.covariance[:5].any()
     assert (np.diagonal(found.covariance[5:], axis1=1, axis2=2) > 1e6).all()
+
+
+def test_frames_that_are_not_sure_take_part_and_lost_ones_do_not(tracked: TossTrack) -> None:
+    """Sure are often those in the hand alone, which show one side."""
+    n = len(tracked.cost)
+    poses, status = tracked.track.camera_from_object.copy(), ["tracked"] * 3 + ["interpolated"] * (n - 5) + ["lost"] * 2
+    poses[-2:] = np.nan
+    unsure = replace(tracked, track=replace(tracked.track, camera_from_object=poses, status=tuple(status)))
+    database = keyframes_of([unsure], None, [n], RegisterConfig().shape, RegisterConfig().ground)
+    assert set(database.frame) == {i for i in range(n - 2) if tracked.store.usable(i)}
 
 
 def test_no_toss_cannot_be_registered() -> None:
