@@ -2,7 +2,8 @@
 
 A shape fused from a toss's own frames repeats the errors of its poses, and so confirms them; the errors of the other
 tosses are independent of them (leave-one-out, Stone 1974). What decides between a toss's tracks is how well its frames
-agree with their own fusion at the poses: a wrong pose blurs the surface, and the outlines contradict it.
+agree with their own fusion at the poses: a wrong pose blurs the surface, and the outlines contradict it. Of an object
+that is located anew, the others' shape and its colours decide, too.
 """
 
 from __future__ import annotations
@@ -29,8 +30,8 @@ TURNS, GAIN = 6, 0.1
 """A further turn is for tosses whose misfit fell by more than this in the last one, and the second for those that the
 first left open, too: on shapes that it corrected."""
 ALIKE = 0.1
-"""Standard deviation by which the logarithms of residuals differ where nothing does: a plain box in its four ways of
-lying (choose-000) has .03 to .14 (shading, tint, the shape's own errors), which more frames do not average out."""
+"""Standard deviation by which the logarithms of residuals differ where nothing does: over a plain box's four ways of
+lying (choose-000) .04 of chromaticity, .14 of depth with outline; more frames do not average that out."""
 SURE_NATS = 0.5 * float(ndtri(0.95)) ** 2
 """What chance makes of a Gaussian once in twenty times (one side)."""
 FAR_BETTER = 0.5 * float(np.log(2.0) / ALIKE) ** 2
@@ -121,18 +122,20 @@ def chosen(run: Run, before: Done, known: TrackResult, shape: Done, images: Imag
         return found[best]
     on_it = each(run, ("refined", "anew"), lambda way: on_shape(run, found[way], shape, images))
     costs = {"before": known.cost, **{way: done.result.cost for way, done in tried.items()}}
-    stays = Evidence(seen[best], costs[best], on_it["refined"])  # before it was refined, it was not yet on the shape
-    return found["anew" if Evidence(seen["anew"], costs["anew"], on_it["anew"]).surely_better(stays) else best]
+    stays = TrackResiduals(
+        seen[best], costs[best], on_it["refined"]
+    )  # before it was refined, it was not yet on the shape
+    return found["anew" if TrackResiduals(seen["anew"], costs["anew"], on_it["anew"]).surely_better(stays) else best]
 
 
 def sure_alone(run: Run, images: Images, alone: Done[TrackResult], anew: Done[TrackResult]) -> bool:
     """Whether a toss's own track fits its frames far better than the object located on a shape: by `FAR_BETTER`."""
-    own, there = (Evidence(on_itself(run, done, images), done.result.cost) for done in (alone, anew))
+    own, there = (TrackResiduals(on_itself(run, done, images), done.result.cost) for done in (alone, anew))
     return own.surely_better(there, FAR_BETTER)
 
 
 @dataclass(frozen=True, eq=False)
-class Evidence:
+class TrackResiduals:
     """What speaks for a track: how its frames agree with their own fusion, what their pairs cost (None: unknown), and
     how they agree with the shape of the others (None: it does not lie on that)."""
 
@@ -140,7 +143,7 @@ class Evidence:
     cost: float | None
     on_others: Explained | None = None
 
-    def surely_better(self, other: Evidence, least: float = SURE_NATS) -> bool:
+    def surely_better(self, other: TrackResiduals, least: float = SURE_NATS) -> bool:
         """Whether all of it together prefers this track by more than `least` nats."""
         judged = [(self.own, other.own)]
         if self.on_others is not None and other.on_others is not None:

@@ -262,6 +262,12 @@ def test_of_ways_that_fit_themselves_alike_the_others_shape_and_its_colors_tell(
     assert cross_fit.chosen(tosses.run, tried.before, OPEN, tried.shape, tosses.images[0]).key == taken
 
 
+@pytest.mark.parametrize(("lost", "better"), [(0, True), (1, False)])
+def test_a_track_that_loses_frames_is_not_better(lost: int, better: bool) -> None:
+    one, other = (cross_fit.TrackResiduals(replace(seen(mm), lost=n), 0.1) for mm, n in ((1.0, lost), (2.0, 0)))
+    assert one.surely_better(other) == better
+
+
 def test_a_track_that_the_shape_makes_worse_stays(
     monkeypatch: pytest.MonkeyPatch, tiny_world: Any, tmp_path: Path
 ) -> None:
@@ -304,7 +310,7 @@ def test_a_toss_that_surely_fits_better_alone_is_not_located_on_the_others(
     assert first_pass.located(tosses.run, tosses.images, joined, own) == {}
 
 
-@pytest.mark.parametrize(("anew_mm", "anew_cost", "sure"), [(2.2, 0.1, False), (1.8, 0.2, True), (4.5, 0.1, True)])
+@pytest.mark.parametrize(("anew_mm", "anew_cost", "sure"), [(2.2, 0.1, False), (1.8, 0.25, True), (4.5, 0.1, True)])
 def test_a_track_alone_that_fits_far_better_is_kept(
     anew_mm: float, anew_cost: float, sure: bool, monkeypatch: pytest.MonkeyPatch, tiny_world: Any, tmp_path: Path
 ) -> None:
