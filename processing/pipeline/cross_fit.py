@@ -122,10 +122,9 @@ def chosen(run: Run, before: Done, known: TrackResult, shape: Done, images: Imag
         return found[best]
     on_it = each(run, ("refined", "anew"), lambda way: on_shape(run, found[way], shape, images))
     costs = {"before": known.cost, **{way: done.result.cost for way, done in tried.items()}}
-    stays = TrackResiduals(
-        seen[best], costs[best], on_it["refined"]
-    )  # before it was refined, it was not yet on the shape
-    return found["anew" if TrackResiduals(seen["anew"], costs["anew"], on_it["anew"]).surely_better(stays) else best]
+    anew = TrackResiduals(seen["anew"], costs["anew"], on_it["anew"])
+    stays = TrackResiduals(seen[best], costs[best], on_it["refined"])  # on the shape it was not before it was refined
+    return found["anew" if anew.surely_better(stays) else best]
 
 
 def sure_alone(run: Run, images: Images, alone: Done[TrackResult], anew: Done[TrackResult]) -> bool:

@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Float32, UInt8
 from numpy import ndarray as Array
 from scipy.special import stdtrit
 
+from processing.sensor.noise import DARK
 from processing.sensor.render import RaycastRenderer
 from recordings.geometry import CameraModel
 from recordings.records import RgbdFrame
@@ -193,8 +194,6 @@ def chromaticity(rgb: UInt8[Array, "n 3"]) -> Float[Array, "n 3"]:
     return values / (values.mean(-1, keepdims=True) + DARK)
 
 
-DARK = 8.0
-"""Grey levels of 255: noise and JPEG's steps of a dark pixel."""
 LEAST_COLORED = 50
 """Pixels without which a frame's light or tint is not solved for."""
 LIGHT_RCOND = 1e-3

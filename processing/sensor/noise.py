@@ -21,6 +21,8 @@ ICP_LEAST_SIGMA_M = 0.0008
 JOINT_LEAST_SIGMA_M = 0.0005
 """The same in the joint objective, where all frames of all tosses speak."""
 
+DARK = 8.0
+"""Grey levels of 255, added to colours before logarithms and ratios: a sensor's noise and black level."""
 STEREO_BASELINE_M = 0.095
 """Between the D455's infrared cameras (data sheet). Along a surface that slants too much disparity grows by more than
 a pixel a pixel, where no matcher follows (Pollard, Mayhew and Frisby, "PMF: a stereo correspondence algorithm using a

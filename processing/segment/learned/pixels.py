@@ -10,12 +10,10 @@ from numpy import ndarray as Array
 from processing.segment.background.channels import sum_of_channels
 from processing.segment.background.foreground import ForegroundSettings, kernel
 from processing.segment.background.static_scene import StaticScene
-from processing.sensor.noise import stereo_sigma_m
+from processing.sensor.noise import DARK, stereo_sigma_m
 
 BLURS_PX = (0.7, 1.8)
 """Colours are looked at through these blurs: of a pixel, and of what is around it."""
-DARK = 8.0
-"""Added to colours (0..255) before logarithms: a sensor's noise and black level."""
 SIGMAS = 4.0
 """Depth before the scene is told in units of so many standard deviations, up to three of them."""
 
