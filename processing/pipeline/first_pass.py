@@ -98,7 +98,7 @@ def kept_apart(
     run: Run, together: Done, shape: Done, images: Mapping[int, Images], joined: Sequence[int]
 ) -> tuple[int, ...]:
     """Tosses that no one shape explains with the others. The outline decides: the share of a toss's mask and the drawn
-    shape that is not common to both, against `CycleConfig.apart_mask`; and half of that must be more than what the
+    shape that is not common to both, against `CycleConfig.apart_mask`; and it must be half as much again as what the
     toss's own frames fused alone leave (a pixel of a small mask is much, a gripper hides some).
 
     Where the shape of all explains all, there are none. Else tosses are added one by one to the first, each kept only
@@ -128,7 +128,7 @@ def _unexplained(
     found = each(run, unexplained, lambda t: fused(run, {t: together}, images))
     own = {t: shape for t, shape in found.items() if shape is not None}
     alone = _left(run, together, own, images) if own else {}
-    return [t for t in alone if left[t] > alone[t] + 0.5 * limit]
+    return [t for t in alone if left[t] > 1.5 * alone[t]]
 
 
 def _left(run: Run, together: Done, shapes: Mapping[int, Done], images: Mapping[int, Images]) -> dict[int, float]:

@@ -222,6 +222,16 @@ def with_shape_error(track: ObjectTrack, alone: ObjectTrack) -> ObjectTrack:
     return replace(track, covariance=covariance)
 
 
+def with_drift(track: ObjectTrack, coarseness: float) -> ObjectTrack:
+    """The track, its covariances as many times as large as means over the session's depth vary more than over fine
+    depth (`DepthNoise.coarseness`).
+
+    The joint refinement knows how depth errs. But where it is coarse, chains of views slip, each pair of which still
+    fits, and no covariance about one solution shows it.
+    """
+    return replace(track, covariance=track.covariance * max(1.0, coarseness))
+
+
 def published(track: ObjectTrack) -> ObjectTrack:
     """The track, `tracked` only where it is as sure as that promises; what is not known of a covariance is no doubt."""
     status = list(track.status)

@@ -127,21 +127,29 @@ def select(
         smooth = refined(scene, replace(out[0].estimated, poses=out[0].joint.poses), first, keep_first, steady)
         out.append(refined(scene, replace(smooth.estimated, poses=smooth.joint.poses), first, keep_first, config))
     best, *others = _again(_compared(scene, out, config), scene, first, keep_first, config)
-    return [_on_shape(scene, best, first, config) if len(scene.store) > n else best, *others]
+    return [_unsure_of_azimuths(scene, best, first, config), *others]
 
 
-def _on_shape(
+def _unsure_of_azimuths(
     scene: Scene, hypothesis: TrajectoryHypothesis, first: int, config: HypothesisConfig
 ) -> TrajectoryHypothesis:
-    """A round body's hypothesis on a learned shape: its views hold the azimuths, but the poses that it was learned from
-    may have been wrong, so that the uncertainty is that which the frames themselves leave."""
-    poses = hypothesis.joint.poses[: len(scene.times_s)]
-    axis = open_axis(scene, poses, hypothesis.use, config.azimuth.axis)
-    if axis is None or not is_round(scene.store, poses, hypothesis.use, axis, config.body):
+    """A hypothesis of free views, or on a learned shape, of a body that looks round: its views hold the azimuths, but
+    wherever they came to lie (what repeats about the axis fits at many, and the shape was learned from such poses), so
+    that the uncertainty is that which all frames together leave."""
+    axis = _round_axis(scene, hypothesis, config)
+    if axis is None:
         return hypothesis
+    poses = hypothesis.joint.poses[: len(scene.times_s)]
     given = given_azimuths(scene, poses, hypothesis.use, axis, config.azimuth)
     disagreement = _inconsistency(scene, hypothesis, given, config)
     return replace(hypothesis, azimuths=with_uncertainty(given, disagreement, first, config.azimuth))
+
+
+def _round_axis(scene: Scene, hypothesis: TrajectoryHypothesis, config: HypothesisConfig) -> Axis | None:
+    """The axis about which its views look round; None where they do not."""
+    poses = hypothesis.joint.poses[: len(scene.times_s)]
+    axis = open_axis(scene, poses, hypothesis.use, config.azimuth.axis)
+    return axis if axis and is_round(scene.store, poses, hypothesis.use, axis, config.body) else None
 
 
 def _is_rather_round(
@@ -176,10 +184,8 @@ def _sought(
 ) -> TrajectoryHypothesis | None:
     """A round body's hypothesis with the azimuths that fit all frames together; None where the body is not round."""
     n, best = len(scene.times_s), hypotheses[0]
-    axis = open_axis(scene, best.joint.poses[:n], best.use, config.azimuth.axis)
-    if axis is None or len(scene.store) > n:
-        return None
-    if not is_round(scene.store, best.joint.poses[:n], best.use, axis, config.body):
+    axis = None if len(scene.store) > n else _round_axis(scene, best, config)
+    if axis is None:
         return None
     easy = replace(config, graph=config.round_body)
     straight = refined(scene, replace(best.estimated, poses=best.joint.poses), first, keep_first, easy, axis, held=True)

@@ -31,8 +31,7 @@ def at_noise(config: TrackConfig, noise: DepthNoise) -> TrackConfig:
     scale_m, window_px = config.hypotheses.graph.schedule[-1][k.GEOMETRY_M], config.view.window_px
     more = max(0.0, pair_cost(noise, scale_m, window_px) - pair_cost(FINE, scale_m, window_px))
     flags, beam, graph = config.flags, config.beam, config.hypotheses.graph
-    flags = replace(flags, tracked_cost=flags.tracked_cost + more, unfit_cost=flags.unfit_cost + more,
-                    correlated=flags.correlated * max(1.0, noise.coarseness))  # fmt: skip
+    flags = replace(flags, tracked_cost=flags.tracked_cost + more, unfit_cost=flags.unfit_cost + more)
     return replace(
         config,
         view=replace(config.view, turn_share=noise.turn_share),

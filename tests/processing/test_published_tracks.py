@@ -11,9 +11,10 @@ import pytest
 
 from processing.pipeline.record import posed_together
 from processing.segment.background.depth_scale import DepthScaleSettings, posterior_sigma
+from processing.sensor.noise import FINE, DepthNoise
 from processing.stages.recording.every_frame import defining_pose, scaled_by_chance
 from processing.store import Done
-from processing.track.flags import SURE_DEG, SURE_M, camera_covariance, published, with_shape_error
+from processing.track.flags import SURE_DEG, SURE_M, camera_covariance, published, with_drift, with_shape_error
 from recordings.geometry import rotation_exp
 from recordings.results.folder import write_track
 from recordings.tracks import ObjectTrack
@@ -131,6 +132,15 @@ def test_what_was_lost_alone_is_as_unsure_as_the_rest_in_the_mean_and_lost_poses
     np.testing.assert_array_equal(still_lost.covariance[7], alone.covariance[7])
     nowhere = ObjectTrack.nowhere(0, "d455", alone.time_ns)
     assert with_shape_error(alone, nowhere) is alone
+
+
+def test_in_coarse_depth_poses_are_as_much_less_sure_as_means_over_it_and_in_fine_depth_no_surer() -> None:
+    track = true_track()
+    coarse, fine = (
+        with_drift(track, DepthNoise(sigma * FINE.sigma_at_1m, 3 * FINE.patch_px).coarseness) for sigma in (2, 0.1)
+    )
+    np.testing.assert_allclose(coarse.covariance, 12 * track.covariance)
+    np.testing.assert_array_equal(fine.covariance, track.covariance)
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,5 @@
 """Stage `every-frame`: what results say of every frame: masks and poses of those that were not worked on, too, how far
-the shape's own error and depth's scale may carry them all, and which of them are sure."""
+the shape's own error, drift and depth's scale may carry them all, and which of them are sure."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from numpy import ndarray as Array
 from processing.run import Run
 from processing.sensor.still import Kept, whole_session
 from processing.store import Done
-from processing.track.flags import published, with_shape_error
+from processing.track.flags import published, with_drift, with_shape_error
 from recordings.results.folder import RobotMasks, read_masks, read_track, write_masks, write_track
 from recordings.results.track_notes import FIT, NOTES
 from recordings.tracks import ObjectTrack
 
-VERSION = 7
+VERSION = 8
 
 
 @dataclass(frozen=True)
@@ -47,6 +47,7 @@ def poses_in_every_frame(
         track = read_track(done.folder, toss)
         if alone is not None:
             track = with_shape_error(track, read_track(alone.folder, toss))
+        track = with_drift(track, run.noise.coarseness)
         defined = defining_pose(track, read_track(first[1].folder, first[0]))
         count = len(track.status)
         if kept is None:
@@ -61,7 +62,7 @@ def poses_in_every_frame(
         write_track(folder, published(scaled_by_chance(track, defined, scale_sigma)))
         return EveryFrameResult(len(track.status), count)
 
-    config = {"toss": toss, "first": first[0], "scale_sigma": scale_sigma}
+    config = {"toss": toss, "first": first[0], "scale_sigma": scale_sigma, "coarseness": run.noise.coarseness}
     return _stage(run, config, inputs, compute)
 
 

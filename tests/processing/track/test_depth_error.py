@@ -111,6 +111,15 @@ def test_poses_are_known_less_well_where_depth_may_err() -> None:
     assert all(np.trace(b[:3, :3]) > np.trace(a[:3, :3]) for a, b in zip(exact[1:], erring[1:], strict=True))
 
 
+def test_the_covariance_says_itself_how_coarse_depth_is() -> None:
+    """Nothing within a run may count the session's noise once more."""
+    poses = turned_poses(3)
+    fine, coarse = (
+        np.trace(refined(poses, 0.0, noise).covariance[-1, 3:, 3:]) for noise in (DepthNoise(0.002, 50.0), NOISE)
+    )
+    assert coarse > 1.5 * fine
+
+
 def one_pair(errors: np.ndarray, side: int = 3):
     """Normal equations of the pair (0, 1) of two views at these errors (2, nodes): depth, print and outline."""
     poses = turned_poses(2)

@@ -33,12 +33,6 @@ def test_without_noise_nothing_costs_and_depth_finer_than_the_thresholds_leaves_
         assert at_noise(usual, noise) == replace(usual, hypotheses=replace(usual.hypotheses, depth_noise=noise))
 
 
-def test_poses_are_as_much_less_sure_as_means_over_depth_are() -> None:
-    coarse = DepthNoise(2 * FINE.sigma_at_1m, 3 * FINE.patch_px)
-    usual, told = TrackConfig().flags, at_noise(TrackConfig(), coarse).flags
-    assert told.correlated == pytest.approx(12 * usual.correlated)
-
-
 def noisy(frames: Any, noise: DepthNoise, seed: int) -> list[Any]:
     """Errors that are alike over the noise's patches: a Gaussian's correlation over pi (2 s)^2 pixels."""
     rng, blur_px, found = np.random.default_rng(seed), (noise.patch_px / (4 * np.pi)) ** 0.5, []

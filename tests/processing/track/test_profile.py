@@ -11,7 +11,9 @@ from processing.sensor import view_layout as lay
 from processing.sensor.rectification import Rectification
 from processing.sensor.view import Crop, ViewConfig
 from processing.sensor.view_store import ViewStore
-from processing.track.beam import Scene
+from processing.track.beam import Hypothesis, Scene
+from processing.track.hypotheses import HypothesisConfig, TrajectoryHypothesis, _unsure_of_azimuths
+from processing.track.joint_refinement import Motion, Refined
 from processing.track.revolution import profile_kernels as rk
 from processing.track.revolution.axis import Axis
 from processing.track.revolution.azimuth import AzimuthConfig, given_azimuths
@@ -158,3 +160,24 @@ def test_an_anchored_view_keeps_its_pose_and_the_axis_its_place_in_space() -> No
         np.testing.assert_allclose(before[:3, :3] @ AXIS.direction, after[:3, :3] @ axis.direction, atol=1e-9)
         there = after[:3, :3] @ axis.point_m + after[:3, 3]
         np.testing.assert_allclose(np.cross(there - before[:3, 3], before[:3, 2]), 0, atol=1e-9)
+
+
+def test_views_of_a_plain_can_that_agree_with_each_other_leave_its_azimuth_open() -> None:
+    """As free views, which no profile ties, they would claim to hold it."""
+    poses = can_poses()
+    store, n = can(poses), len(poses)
+    assert all(store.fill(i) for i in range(n))
+    yes, no, none = np.ones(n, dtype=bool), np.zeros(n, dtype=bool), np.full(n, np.nan)
+    motion = Motion(np.arange(n) / 30, np.zeros(n, dtype=np.int64), np.zeros(3), np.zeros(3), no)
+    joint = Refined(poses, np.zeros((n, 6, 6)), np.zeros((0, 2), dtype=np.int64), np.zeros((0, 3)))
+    start = Hypothesis(poses, none, none, tuple(range(n)), (0,), 0.0)
+    free = TrajectoryHypothesis(start, yes, no, joint, np.zeros(3), motion, 0.0, np.full(n, -1))
+    scene = Scene(store, motion.times_s, np.zeros(3), np.zeros(3), Sift())
+    found = _unsure_of_azimuths(scene, free, 0, HypothesisConfig())
+    assert found.axis is None
+    assert found.azimuths is not None
+    assert abs(found.azimuths.axis.direction[2]) > 0.99
+    sigma_deg = np.degrees(found.azimuths.sigma_rad)
+    assert sigma_deg[0] == 0
+    assert (np.diff(sigma_deg) > 0).all()
+    assert sigma_deg[-1] > 10
