@@ -119,11 +119,13 @@ def _samples(
 
 
 def _trained(samples: tuple[_Samples, ...]) -> Any:
+    """The same forest of the same samples: OpenCV draws by a state that everything before has left behind."""
     features, classes = (np.concatenate([getattr(s, name) for s in samples]) for name in ("features", "classes"))
     forest = cv2.ml.RTrees.create()
     forest.setMaxDepth(DEPTH)
     forest.setMinSampleCount(LEAF)
     forest.setActiveVarCount(round(features.shape[1] ** 0.5))
     forest.setTermCriteria((cv2.TERM_CRITERIA_MAX_ITER, TREES, 0.0))
+    cv2.setRNGSeed(0)
     forest.train(features, cv2.ml.ROW_SAMPLE, classes)
     return forest

@@ -198,6 +198,17 @@ def test_two_that_have_one_mean_colour_are_told_apart_by_their_contrast() -> Non
     assert not odds[:20].any()
 
 
+def test_what_was_learned_before_changes_nothing_of_what_one_frame_teaches() -> None:
+    """Tosses are followed one after another or side by side, and their masks are the same."""
+    left, right = np.zeros((H, W), dtype=bool), np.zeros((H, W), dtype=bool)
+    left[30:90, 20:75], right[30:90, 80:140] = True, True
+    seen = picture(left, right, (150, 120, 110), 0)
+    one, other = (Patches.of(seen.color_rgb, left, right) for _ in range(2))
+    assert one is not None
+    assert other is not None
+    np.testing.assert_array_equal(*(p.log_odds(seen.color_rgb, left | right) for p in (one, other)))
+
+
 def test_the_table_between_a_hands_fingers_is_neither_hand_nor_object() -> None:
     """Stereo gives it the hand's depth; it has a shade that the object shows too, and the hand does not."""
     rng = np.random.default_rng(0)
