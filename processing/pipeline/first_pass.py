@@ -23,6 +23,10 @@ from processing.store import Done
 from processing.variants import refuse_baseline
 from recordings.errors import BadInput
 
+APART = 1.5
+"""An outline that a common shape misses by so many times what the toss's own frames alone do is not explained: a ratio,
+because masks that are bad alike miss more either way. Tosses of `judge-021` that belong together: 1.2 and 1.3."""
+
 
 def first_pass(run: Run, alone: Mapping[int, Done], images: Mapping[int, Images]) -> Pass:
     """P, O: all tosses in one object frame, and one shape. Tosses that the shape of all does not explain are kept
@@ -98,8 +102,8 @@ def kept_apart(
     run: Run, together: Done, shape: Done, images: Mapping[int, Images], joined: Sequence[int]
 ) -> tuple[int, ...]:
     """Tosses that no one shape explains with the others. The outline decides: the share of a toss's mask and the drawn
-    shape that is not common to both, against `CycleConfig.apart_mask`; and it must be half as much again as what the
-    toss's own frames fused alone leave (a pixel of a small mask is much, a gripper hides some).
+    shape that is not common to both, against `CycleConfig.apart_mask`; and it must be `APART` times what the toss's own
+    frames fused alone leave (a pixel of a small mask is much, a gripper hides some).
 
     Where the shape of all explains all, there are none. Else tosses are added one by one to the first, each kept only
     where the frames fused so far explain every toss among them.
@@ -128,7 +132,7 @@ def _unexplained(
     found = each(run, unexplained, lambda t: fused(run, {t: together}, images))
     own = {t: shape for t, shape in found.items() if shape is not None}
     alone = _left(run, together, own, images) if own else {}
-    return [t for t in alone if left[t] > 1.5 * alone[t]]
+    return [t for t in alone if left[t] > APART * alone[t]]
 
 
 def _left(run: Run, together: Done, shapes: Mapping[int, Done], images: Mapping[int, Images]) -> dict[int, float]:
