@@ -17,6 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Float32
 from numpy import ndarray as Array
+from scipy.optimize import least_squares
 
 from calibration.cameras.bundle import Observations, Scene, Solved, adjust
 from calibration.cameras.extrinsics import whitening
@@ -113,17 +114,12 @@ def fit_table(
     start = _start(tags, depth_points_m)
     depth = depth_points_m
     tie = tags is not None and depth is not None
-    numbers, frame = np.zeros(4), _axes(start)
+    frame = _axes(start)
     middle = np.median(depth if depth is not None else np.asarray(tags[0] if tags else ()), axis=0)
     origin = middle - start.normal * (start.normal @ middle - start.offset_m)
-    for _ in range(8):
-        J, left = _system(numbers, frame, origin, tags, depth, tag_height_m, tie)
-        step = np.linalg.lstsq(J, -left, rcond=None)[0]
-        numbers = numbers + step
-        if np.abs(step).max() < 1e-10:
-            break
-    J, left = _system(numbers, frame, origin, tags, depth, tag_height_m, tie)
-    covariance = np.linalg.pinv(J.T @ J, hermitian=True)
+    fit = least_squares(_residuals, np.zeros(4), x_scale="jac", args=(frame, origin, tags, depth, tag_height_m, tie))
+    numbers = fit.x
+    covariance = np.linalg.pinv(fit.jac.T @ fit.jac, hermitian=True)
     normal, offset = _plane(numbers, frame, origin)
     plane = Plane(
         normal,
@@ -157,7 +153,7 @@ def _plane(numbers: Array, frame: Array, origin: Array) -> tuple[Array, float]:
     return normal, float(normal @ origin + numbers[2])
 
 
-def _system(
+def _residuals(
     numbers: Array,
     frame: Array,
     origin: Array,
@@ -165,22 +161,18 @@ def _system(
     depth: Array | None,
     tag_height_m: float,
     tie: bool,
-) -> tuple[Array, Array]:
-    def residual(at: Array) -> Array:
-        normal, offset = _plane(at, frame, origin)
-        parts = [at[3:] / SCALE_SIGMA]
-        if tags is not None:
-            sigma = np.sqrt(np.einsum("i,nij,j->n", frame[:, 2], tags[1], frame[:, 2]) + 1e-10)
-            parts.append((tags[0] @ normal - offset - tag_height_m) / sigma)
-        if depth is not None:
-            scale = 1.0 + at[3] if tie else 1.0
-            weight = min(1.0, np.sqrt(DEPTH_POINTS / len(depth))) / DEPTH_SIGMA_M
-            parts.append((depth @ normal / scale - offset) * weight)
-        return np.concatenate(parts)
-
-    here = residual(numbers)
-    J = np.stack([(residual(numbers + 1e-7 * np.eye(4)[k]) - here) / 1e-7 for k in range(4)], -1)
-    return J, here
+) -> Array:
+    """In standard deviations: of the scale from 1, of the tags' and of depth's heights over the plane."""
+    normal, offset = _plane(numbers, frame, origin)
+    parts = [numbers[3:] / SCALE_SIGMA]
+    if tags is not None:
+        sigma = np.sqrt(np.einsum("i,nij,j->n", frame[:, 2], tags[1], frame[:, 2]) + 1e-10)
+        parts.append((tags[0] @ normal - offset - tag_height_m) / sigma)
+    if depth is not None:
+        scale = 1.0 + numbers[3] if tie else 1.0
+        weight = min(1.0, np.sqrt(DEPTH_POINTS / len(depth))) / DEPTH_SIGMA_M
+        parts.append((depth @ normal / scale - offset) * weight)
+    return np.concatenate(parts)
 
 
 def _left_over(

@@ -24,8 +24,9 @@ from calibration.cameras.targets import TargetView
 from calibration.hand_eye_start import best_start
 from calibration.report import Finding, Report, limit
 from recordings.errors import BadInput
+from recordings.estimation.levenberg_marquardt import Expansion, minimised
+from recordings.estimation.robust import huber_cost, huber_weight
 from recordings.geometry import CameraModel
-from recordings.robust import huber_cost, huber_weight
 
 Mounting = Literal["eye-to-hand", "eye-in-hand"]
 LEAST_POSES, GOOD_POSES = 5, 15
@@ -37,7 +38,7 @@ GOOD_DEG, WORST_DEG = 0.3, 1.0
 GOOD_PX, WORST_PX = 0.5, 3.0
 FOLDS = 4
 HUBER = 2.5
-STEPS = 30
+STEPS, LEAST_GAIN = 30, 1e-5
 ROUNDS, CONVERGED_RATIO = 6, 1.05
 DIFFERENCE, POSE_DIFFERENCE = 1e-7, 1e-4
 
@@ -245,11 +246,18 @@ def _solve(observations: _Observations, start: tuple[Array, Array], arm: ArmAccu
     def residuals(numbers: Array) -> Array:
         return np.concatenate([np.einsum("nij,nj->ni", white, gaps(numbers)).ravel(), numbers[12:]])
 
-    numbers, J, left = _gauss_newton(residuals, np.zeros(12 + 6 * count), owner)
+    def expanded(numbers: Array) -> _Linear:
+        plain = residuals(numbers)
+        weight = np.sqrt(huber_weight(np.abs(plain), HUBER))
+        J, left = weight[:, None] * _jacobian(residuals, numbers, plain, owner), weight * plain
+        return _Linear(float(huber_cost(np.abs(plain), HUBER).sum()), J.T @ J, J.T @ left, J, left, weight)
+
+    found = minimised(np.zeros(12 + 6 * count), expanded, np.add, STEPS, LEAST_GAIN)
+    numbers, J, left, weight = found.state, found.at.jacobian, found.at.residuals, found.at.weight
     X, T, off = split(numbers)
     scale = max(1.0, float(left @ left) / max(1, len(left) - len(numbers)))
     inverse = np.linalg.pinv(J.T @ J, hermitian=True)
-    covariance, weight = scale * inverse[:6, :6], _root_weights(residuals(numbers))
+    covariance = scale * inverse[:6, :6]
     for other in observations.lens.others(observations.model):
         change = np.einsum("nij,nj->ni", white, gaps(numbers, other) - gaps(numbers)).ravel()
         moved = -(inverse @ J.T @ (weight * np.append(change, np.zeros(6 * count))))[:6]
@@ -259,31 +267,13 @@ def _solve(observations: _Observations, start: tuple[Array, Array], arm: ArmAccu
     return _Refined(X, T, covariance, -gaps(numbers), robot_deg, robot_mm)
 
 
-def _root_weights(residuals: Array) -> Array:
-    """Roots of Huber's weights."""
-    return np.sqrt(huber_weight(np.abs(residuals), HUBER))
+@dataclass(frozen=True, eq=False)
+class _Linear(Expansion):
+    """With the weighted derivatives and residuals that it is made of, and the roots of Huber's weights."""
 
-
-def _gauss_newton(residuals: Callable[[Array], Array], numbers: Array, owner: Array) -> tuple[Array, Array, Array]:
-    """Damped Gauss-Newton with Huber's weights: the numbers, the weighted derivatives and residuals there."""
-    damping, best = 1e-6, np.inf
-    weight = J = left = np.zeros(0)
-    trial = numbers
-    for _ in range(STEPS):
-        plain = residuals(trial)
-        weight = _root_weights(plain)
-        cost = 2 * float(huber_cost(np.abs(plain), HUBER).sum())
-        if cost < best:
-            gain, best, numbers, damping = best - cost, cost, trial, max(damping / 10, 1e-9)
-            left = weight * plain
-            if gain < 1e-5 * cost:
-                break
-            J = weight[:, None] * _jacobian(residuals, numbers, plain, owner)
-        else:
-            damping *= 10
-        normal = J.T @ J
-        trial = numbers - np.linalg.solve(normal + damping * np.diag(np.diag(normal)), J.T @ left)
-    return numbers, J, left
+    jacobian: Float[Array, "n u"]
+    residuals: Float[Array, " n"]
+    weight: Float[Array, " n"]
 
 
 def _jacobian(residuals: Callable[[Array], Array], at: Array, here: Array, owner: Array) -> Array:

@@ -9,7 +9,7 @@ left out. Offsets of several tosses are pooled by their variances, widened where
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -23,15 +23,18 @@ from calibration.cameras.targets import TargetView
 from calibration.report import Finding, Report, limit
 from recordings.constants import GRAVITY_M_S2, MAD_TO_SIGMA
 from recordings.errors import BadInput
+from recordings.estimation.levenberg_marquardt import Expansion, minimised
+from recordings.estimation.robust import huber_cost, huber_weight
 from recordings.geometry import CameraModel
-from recordings.robust import huber_weight
 
 GOOD_MS, WORST_MS = 1.0, 5.0
 LEAST_SPEED_M_S = 0.15
 JERKY_M_S2 = 20.0
 """Accelerations further than this from both rest and free fall belong to an impact."""
 SEARCH_S, SEARCHED = 0.1, 15
-FINEST_S = 1e-6
+FURTHEST_S = 0.02
+"""The furthest that an offset moves in a step."""
+STEPS, LEAST_GAIN = 6, 1e-9
 RIG_TURN, RIG_SHIFT_M = 0.003, 0.003
 """How far calibration may be off (standard deviations) while the offset is found."""
 OPEN_TURN, OPEN_SHIFT_M = 0.1, 0.1
@@ -197,7 +200,7 @@ def _solve(
     start: Float[Array, " k"],
     whiten: Float[Array, "n 2 2"] | None,
 ) -> tuple[TimeOffset, Float[Array, " k"]]:
-    """Coarse search for the offset, then Gauss-Newton over offset and displacement with robust weights."""
+    """Coarse search for the offset, then least squares over offset and displacement with a robust kernel."""
     speed_m_s = np.linalg.norm(np.diff(reference.position_m, axis=0), axis=1) / np.diff(reference.time_s)
     if not len(speed_m_s) or np.quantile(speed_m_s, 0.9) < LEAST_SPEED_M_S:
         raise BadInput(
@@ -219,7 +222,7 @@ def _solve(
         raise BadInput("the two streams do not overlap in time within 0.1 s; are they of the same toss and clock?")
     numbers = best[1]
     for _ in range(3):
-        numbers = _fit(residual, numbers, prior, _used(reference, stamps, numbers[0]), 6, False)
+        numbers = _fit(residual, numbers, prior, _used(reference, stamps, numbers[0]), STEPS, False)
     used = _used(reference, stamps, numbers[0])
     return _finished(residual, gap, numbers, prior, used, stamps), numbers[1:]
 
@@ -234,19 +237,24 @@ def _error(residual: Callable[[Array], Array], numbers: Array, used: Bool[Array,
     return float(np.median(np.abs(residual(numbers)[used])))
 
 
-def _system(
-    residual: Callable[[Array], Array], numbers: Array, prior: Array, used: Bool[Array, " n"]
-) -> tuple[Array, Array, float]:
-    """Weighted derivatives and residuals with the prior's rows, and the residuals' robust scale."""
+def _expanded(
+    residual: Callable[[Array], Array], numbers: Array, prior: Array, used: Bool[Array, " n"], scale: float
+) -> Expansion:
+    """Huber's cost of the residuals in units of their scale, and of the displacement beside its prior."""
     here = residual(numbers)[used].ravel()
     steps = np.concatenate([[1e-5], np.full(len(numbers) - 1, 1e-6)])
     J = np.stack(
         [(residual(numbers + s * np.eye(len(numbers))[k])[used].ravel() - here) / s for k, s in enumerate(steps)], -1
     )
-    scale = max(MAD_TO_SIGMA * float(np.median(np.abs(here))), 1e-9)
-    weight = np.sqrt(huber_weight(np.abs(here), HUBER * scale)) / scale
-    rows = np.hstack([np.zeros((len(prior), 1)), np.diag(prior)])
-    return np.vstack([weight[:, None] * J, rows]), np.concatenate([weight * here, prior * numbers[1:]]), scale
+    size = np.abs(here) / scale
+    root = np.sqrt(huber_weight(size, HUBER)) / scale
+    seen = Expansion.of_residuals(root * here, root[:, None] * J, float(huber_cost(size, HUBER).sum()))
+    return seen.with_prior(np.diag(np.concatenate([[0.0], prior**2])), numbers)
+
+
+def _scale(residual: Callable[[Array], Array], numbers: Array, used: Bool[Array, " n"]) -> float:
+    """The residuals' robust standard deviation."""
+    return max(MAD_TO_SIGMA * float(np.median(np.abs(residual(numbers)[used]))), 1e-9)
 
 
 def _fit(
@@ -259,17 +267,20 @@ def _fit(
 ) -> Array:
     if used.sum() < LEAST_FRAMES:
         return numbers
-    for _ in range(steps):
-        J, left, _ = _system(residual, numbers, prior, used)
-        if hold_offset:
-            J = J.copy()
-            J[:, 0] = 0.0
-        change = np.linalg.lstsq(J, -left, rcond=None)[0]
-        change[0] = np.clip(change[0], -0.02, 0.02)
-        numbers = numbers + change
-        if abs(change[0]) < FINEST_S and not hold_offset:
-            break
-    return numbers
+    scale = _scale(residual, numbers, used)
+
+    def expanded(at: Array) -> Expansion:
+        found = _expanded(residual, at, prior, used, scale)
+        if not hold_offset:
+            return found
+        information, gradient = found.information.copy(), found.gradient.copy()
+        information[0], information[:, 0], gradient[0] = 0.0, 0.0, 0.0
+        return replace(found, information=information, gradient=gradient)
+
+    def moved(at: Array, step: Array) -> Array:
+        return at + np.concatenate([np.clip(step[:1], -FURTHEST_S, FURTHEST_S), step[1:]])
+
+    return minimised(numbers, expanded, moved, steps, LEAST_GAIN).state
 
 
 def _finished(
@@ -280,11 +291,14 @@ def _finished(
     used: Bool[Array, " n"],
     stamps: Array,
 ) -> TimeOffset:
-    J, left, _ = _system(residual, numbers, prior, used)
+    scale = _scale(residual, numbers, used)
+    size = np.abs(residual(numbers)[used]) / scale
+    left_over = max(1.0, float((huber_weight(size, HUBER) * size**2).mean()))
     frames = len(np.unique(stamps[used]))
     per_frame = max(1.0, used.sum() / max(frames, 1))
     # points of one frame err together (interpolation, pose), so frames count, not points
-    variance = np.linalg.pinv(J.T @ J, hermitian=True)[0, 0] * max(1.0, float(left @ left) / len(left)) * per_frame
+    information = _expanded(residual, numbers, prior, used, scale).information
+    variance = np.linalg.pinv(information, hermitian=True)[0, 0] * left_over * per_frame
     rms = float(np.sqrt((gap(numbers[0], numbers[1:])[used] ** 2).mean()))
     return TimeOffset(float(numbers[0]), float(np.sqrt(variance)), frames, rms)
 

@@ -21,13 +21,19 @@ from calibration.tags.detect import TagDetection, detect_tags
 from groundtruth import se3
 from groundtruth.session_solve import Solved
 from groundtruth.toss_truth import MOMENT_S, TossTruth, TrackedLimits, statuses
+from recordings.estimation.levenberg_marquardt import Expansion, minimised
+from recordings.estimation.robust import huber_cost, huber_weight
 from recordings.geometry import CameraModel
 from recordings.mcap.codec import decode_image
 from recordings.progress import Progress
-from recordings.robust import huber_weight
 from recordings.session import Session
 
 CAMERA = "d455"
+STEPS, LEAST_GAIN = 12, 1e-8
+NOISE_ROUNDS = 4
+"""How often the noise is measured again on what is left at the place that it led to."""
+NEAREST_M = 0.05
+"""A corner nearer to the camera was never seen."""
 CORNERS = np.array([[-0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [-0.5, -0.5, 0.0]])
 """Of a tag of size 1 in pupil-apriltags' frame and order."""
 
@@ -114,6 +120,19 @@ class _Place:
     noise: float
     late_s: float
     late_std_s: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Free:
+    """What is solved for: the camera, how short edges appear, how late the poses come."""
+
+    camera: Float[Array, "4 4"]
+    short_px: float
+    late_s: float
+
+    def moved(self, step: Float[Array, "8"]) -> _Free:
+        camera = se3.exp(step[None, :6])[0] @ self.camera
+        return _Free(camera, self.short_px + float(step[6]), self.late_s + float(step[7]))
 
 
 def refine_by_d455(
@@ -232,26 +251,35 @@ def _placed(
     speed = np.nan_to_num((soon - world) / MOMENT_S)
     pixels, outwards = (np.concatenate([getattr(s, name) for s in sure]) for name in ("pixels", "outwards"))
     sigma = np.concatenate([s.sigma_px for s in sure])
-    prior = 1 / np.array([config.place_rad] * 3 + [config.place_m] * 3 + [config.short_px, config.late_s])
-    camera, off, noise, information = known, np.zeros(8), 1.0, np.eye(8)
-    for _ in range(10):
-        inside = (world + off[7] * speed) @ camera[:3, :3].T + camera[:3, 3]
-        residual = model.project(inside) - pixels - off[6] * outwards
-        size = np.linalg.norm(residual, axis=1) / sigma
-        noise = max(1.0, float(np.median(size)) / 1.177)  # the median of a two-dimensional normal's length
-        root = np.sqrt(huber_weight(size / noise, config.huber)) / (sigma * noise)
+    prior = np.diag(np.array([config.place_rad] * 3 + [config.place_m] * 3 + [config.short_px, config.late_s]) ** -2.0)
+
+    def left(at: _Free) -> tuple[Array, Array]:
+        """Corners in the camera, and how far they are from where they were seen (px)."""
+        inside = (world + at.late_s * speed) @ at.camera[:3, :3].T + at.camera[:3, 3]
+        return inside, model.project(inside) - pixels - at.short_px * outwards
+
+    def expanded(at: _Free) -> Expansion:
+        inside, residual = left(at)
+        size = np.linalg.norm(residual, axis=1) / (sigma * noise)
+        root = np.sqrt(huber_weight(size, config.huber)) / (sigma * noise)
         arm = np.concatenate([-se3.skew(inside), np.broadcast_to(np.eye(3), (len(inside), 3, 3))], -1)
         by_point = _by_point(model, inside)
-        by_time = by_point @ (speed @ camera[:3, :3].T)[..., None]
-        J = np.concatenate([by_point @ arm, -outwards[..., None], by_time], -1) * root[:, None, None]
-        off[:6] = se3.log((camera @ np.linalg.inv(known))[None])[0]
-        information = np.einsum("nij,nik->jk", J, J) + np.diag(prior**2)
-        step = np.linalg.solve(information, -np.einsum("nij,ni->j", J, residual * root[:, None]) - prior**2 * off)
-        camera = se3.exp(step[None, :6])[0] @ camera
-        off[6:] += step[6:]
-    late_std_s = float(np.sqrt(np.linalg.inv(information)[7, 7]))
-    return _Place(camera, float(off[6]), noise, float(off[7]), late_std_s), float(
-        np.median(np.linalg.norm(residual, axis=1))
+        by_time = by_point @ (speed @ at.camera[:3, :3].T)[..., None]
+        J = np.concatenate([by_point @ arm, -outwards[..., None], by_time], -1)
+        cost = float(huber_cost(size, config.huber).sum())
+        seen = Expansion.of_residuals(residual * root[:, None], J * root[:, None, None], cost)
+        off = se3.log((at.camera @ np.linalg.inv(known))[None])[0]
+        return seen.with_prior(prior, np.concatenate([off, [at.short_px, at.late_s]]))
+
+    at = _Free(known, 0.0, 0.0)
+    for _ in range(NOISE_ROUNDS):
+        size = np.linalg.norm(left(at)[1], axis=1) / sigma
+        noise = max(1.0, float(np.median(size)) / 1.177)  # the median of a two-dimensional normal's length
+        found = minimised(at, expanded, _Free.moved, STEPS, LEAST_GAIN)
+        at = found.state
+    late_std_s = float(np.sqrt(np.linalg.inv(found.at.information)[7, 7]))
+    return _Place(at.camera, at.short_px, noise, at.late_s, late_std_s), float(
+        np.median(np.linalg.norm(left(at)[1], axis=1))
     )
 
 
@@ -305,25 +333,36 @@ def _fused(
         return None
     prior, sigma = np.linalg.inv(covariance), seen.sigma_px * place.noise
     pixels = seen.pixels + place.short_px * seen.outwards
-    turned, shift, total = pose[:3, :3], pose[:3, 3], np.zeros(6)
-    information = prior
-    for _ in range(8):
-        arm = seen.points_m @ turned.T
-        inside = (arm + shift) @ place.camera_from_world[:3, :3].T + place.camera_from_world[:3, 3]
-        if (inside[:, 2] < 0.05).any():
-            return None
-        residual = model.project(inside) - pixels
-        size = np.linalg.norm(residual, axis=1) / sigma
-        root = np.sqrt(huber_weight(size, config.huber)) / sigma
+
+    def left(at: Array) -> tuple[Array, Array, Array]:
+        """Corners about the body's origin (world axes) and in the camera, and how far they are from where they were
+        seen, in standard deviations."""
+        arm = seen.points_m @ at[:3, :3].T
+        inside = (arm + at[:3, 3]) @ place.camera_from_world[:3, :3].T + place.camera_from_world[:3, 3]
+        return arm, inside, (model.project(inside) - pixels) / sigma[:, None]
+
+    def off(at: Array) -> Array:
+        return np.concatenate([se3.log(se3.rotations(at[:3, :3] @ pose[:3, :3].T)[None])[0, :3], (at - pose)[:3, 3]])
+
+    def expanded(at: Array) -> Expansion:
+        arm, inside, residual = left(at)
+        size = np.linalg.norm(residual, axis=1)
+        root = np.sqrt(huber_weight(size, config.huber))[:, None]
         by_pose = np.concatenate([-se3.skew(arm), np.broadcast_to(np.eye(3), (len(arm), 3, 3))], -1)
-        J = _by_point(model, inside) @ place.camera_from_world[:3, :3] @ by_pose * root[:, None, None]
-        information = np.einsum("nij,nik->jk", J, J) + prior
-        step = np.linalg.solve(information, -np.einsum("nij,ni->j", J, residual * root[:, None]) - prior @ total)
-        turned = se3.exp(np.concatenate([step[:3], np.zeros(3)])[None])[0, :3, :3] @ turned
-        shift = shift + step[3:]
-        total = np.concatenate([se3.log(se3.rotations(turned @ pose[:3, :3].T)[None])[0, :3], shift - pose[:3, 3]])
-    if np.median(size) > config.too_far or total @ prior @ total > config.too_strange**2:
+        J = _by_point(model, inside) @ place.camera_from_world[:3, :3] @ by_pose
+        cost = float(huber_cost(size, config.huber).sum()) if (inside[:, 2] > NEAREST_M).all() else np.inf
+        found = Expansion.of_residuals(residual * root, J * (root / sigma[:, None])[..., None], cost)
+        return found.with_prior(prior, off(at))
+
+    def moved(at: Array, step: Array) -> Array:
+        out = se3.exp(np.concatenate([step[:3], np.zeros(3)])[None])[0]
+        out[:3, :3], out[:3, 3] = out[:3, :3] @ at[:3, :3], at[:3, 3] + step[3:]
+        return out
+
+    if (left(pose)[1][:, 2] < NEAREST_M).any():
         return None
-    out = np.eye(4)
-    out[:3, :3], out[:3, 3] = turned, shift
-    return out, np.linalg.inv(information)
+    found = minimised(pose, expanded, moved, STEPS, LEAST_GAIN)
+    total, far = off(found.state), np.median(np.linalg.norm(left(found.state)[2], axis=1))
+    if far > config.too_far or total @ prior @ total > config.too_strange**2:
+        return None
+    return found.state, np.linalg.inv(found.at.information)

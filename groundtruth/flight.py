@@ -12,7 +12,7 @@ from numpy import ndarray as Array
 from groundtruth import se3
 from groundtruth.factors import Arc
 from groundtruth.interpolate import GRAVITY_WORLD_M_S2
-from recordings.robust import geman_mcclure_weight
+from recordings.estimation.robust import geman_mcclure_weight
 
 Order = Mapping[int, tuple[Array, Array]]
 """Per toss: times (ns) and the numbers of the body's poses at them."""

@@ -40,8 +40,9 @@ from groundtruth.factors import (
     prior_terms,
 )
 from recordings.errors import TosslabError
+from recordings.estimation.levenberg_marquardt import Expansion, minimised
+from recordings.estimation.robust import huber_cost, huber_weight
 from recordings.geometry import CameraModel
-from recordings.robust import huber_cost, huber_weight
 
 
 class Undetermined(TosslabError):
@@ -111,25 +112,17 @@ class Solution:
 def solve(graph: Graph, config: SolverConfig) -> Solution:
     """Minimise the graph's cost from its start. Raises Undetermined where a pose is not fixed."""
     system, order = _System(graph, config), elimination_order(graph)
-    poses = np.stack(graph.start)
-    damping, cost, used = 1e-6, system.cost(poses), 0
-    information, right = system.normal_equations(poses)
-    for used in range(1, config.iterations + 1):  # noqa: B007 told in the solution
-        step = _damped_step(graph, information, right, damping, order)
-        candidate = poses @ se3.exp(step.reshape(-1, 6))
-        new_cost = system.cost(candidate)
-        if not new_cost <= cost:
-            damping = max(damping * 10, 1e-6)
-            if damping > 1e8:
-                break
-            continue
-        gain = (cost - new_cost) / max(cost, 1e-12)
-        poses, cost, damping = candidate, new_cost, max(damping / 10, 1e-9)
-        information, right = system.normal_equations(poses)
-        if gain < config.least_gain:
-            break
+    found = minimised(
+        np.stack(graph.start),
+        system.expanded,
+        lambda poses, step: poses @ se3.exp(step.reshape(-1, 6)),
+        config.iterations,
+        config.least_gain,
+        lambda information, right, damping: _damped_solution(graph, information, right, damping, order),
+    )
+    information = found.at.information
     _check_determined(graph, information, config, order)
-    return Solution(poses, system.residuals_px(poses), cost, used, information, order)
+    return Solution(found.state, system.residuals_px(found.state), found.at.cost, found.steps, information, order)
 
 
 def covariances(solution: Solution, poses: Sequence[int]) -> Float[Array, "k 6 6"]:
@@ -171,7 +164,7 @@ class Factor:
         return out
 
 
-def _damped_step(
+def _damped_solution(
     graph: Graph, information: sparse.csc_matrix, right: Float[Array, " d"], damping: float, order: Int[Array, " d"]
 ) -> Float[Array, " d"]:
     diagonal = information.diagonal()
@@ -232,32 +225,28 @@ class _System:
         self._sigma = np.array([q.sigma_px for q in p])
         self._pattern: BlockPattern | None = None
 
-    def cost(self, poses: Float[Array, "n 4 4"]) -> float:
-        total = 0.0
-        if len(self._chain):
-            residual = self._pixels(poses)[0]
-            total += float(self._robust(np.linalg.norm(residual, axis=-1) / self._sigma[:, None])[0].sum())
-        for residuals, *_ in self._others(poses):
-            total += 0.5 * float((residuals**2).sum())
-        return total if np.isfinite(total) else np.inf
-
-    def residuals_px(self, poses: Float[Array, "n 4 4"]) -> Float[Array, "m 4 2"]:
-        return self._pixels(poses)[0]
-
-    def normal_equations(self, poses: Float[Array, "n 4 4"]) -> tuple[sparse.csc_matrix, Float[Array, " d"]]:
-        """J' W J and -J' W r over all factors."""
+    def expanded(self, poses: Float[Array, "n 4 4"]) -> Expansion:
+        """The cost, J' W J and J' W r over all factors."""
         terms: list[Terms] = []
+        cost = 0.0
         if len(self._chain):
             residual, jacobians = self._linearised(poses)
-            weight = self._robust(np.linalg.norm(residual, axis=-1) / self._sigma[:, None])[1]
+            each, weight = self._robust(np.linalg.norm(residual, axis=-1) / self._sigma[:, None])
+            cost = float(each.sum())
             root = np.sqrt(weight) / self._sigma[:, None]
             residual = (residual * root[..., None]).reshape(len(residual), 8)
             scaled = [(J * root[..., None, None]).reshape(len(residual), 8, 6) for J in jacobians]
             terms.append((residual, scaled, self._chain))
-        terms += self._others(poses)
+        others = self._others(poses)
+        cost += sum(0.5 * float((residuals**2).sum()) for residuals, *_ in others)
+        terms += others
         if self._pattern is None:
             self._pattern = BlockPattern(len(poses), [index for _, _, index in terms])
-        return self._pattern.sum(terms)
+        information, right = self._pattern.sum(terms)
+        return Expansion(cost, information, -right)
+
+    def residuals_px(self, poses: Float[Array, "n 4 4"]) -> Float[Array, "m 4 2"]:
+        return self._pixels(poses)[0]
 
     def _pixels(self, poses: Float[Array, "n 4 4"]) -> tuple[Array, Array, Array, Array]:
         """Residuals (m, 4, 2), points in the body, rig and camera frames (m, 4, 3)."""

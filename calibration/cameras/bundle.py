@@ -4,8 +4,8 @@ A point p of piece g, seen by camera c in view v, lies in that camera at X = C_c
 s, C = camera_from_rig, V = rig_from_body, G = body_from_piece, and d the shift of the printed mark m that p belongs to.
 Each is free or fixed, and so is each camera's lens. Two more are known beforehand to be small: the marks' shifts d (no
 printer puts marks quite where they should be) and a slip of each image as a whole, which makes its points err alike.
-Residuals are whitened by the pixels' covariances; Huber's weight tames outliers. Levenberg-Marquardt on the normal
-equations, which are small here (some hundred unknowns). Free poses move by left increments exp([w, t]^) P, so a pose's
+Residuals are whitened by the pixels' covariances; Huber's weight tames outliers. The normal equations are small here
+(some hundred unknowns). Free poses move by left increments exp([w, t]^) P, so a pose's
 covariance is that of (rotation vector, translation) in the frame it maps to.
 """
 
@@ -21,8 +21,9 @@ from scipy import sparse
 
 from calibration.cameras.poses import exp_poses
 from calibration.cameras.projection_derivatives import by_lens, by_motion, by_point, lens_numbers, projected, with_lens
+from recordings.estimation.levenberg_marquardt import Expansion, minimised
+from recordings.estimation.robust import huber_cost, huber_weight
 from recordings.geometry import CameraModel
-from recordings.robust import huber_cost, huber_weight
 
 POSE = 6
 STEPS = 100
@@ -135,42 +136,39 @@ class Solved:
 def adjust(scene: Scene, seen: Observations, huber: float | None = 3.0) -> Solved:
     """Minimise the whitened reprojection errors. `huber`: in standard deviations; None for plain least squares."""
     blocks, size = _blocks(scene)
-    damping = 1e-3
-    residual, weight, jacobian = _linearised(scene, seen, blocks, size, huber)
-    cost = _cost(residual, huber) + _prior_cost(scene)
-    for _ in range(STEPS):
-        normal, gradient = _normal(jacobian, residual, weight, scene, blocks)
-        step = _solve(normal, gradient, damping)
-        trial = _moved(scene, blocks, step)
-        new_cost = _cost(_whitened(trial, seen)[0], huber) + _prior_cost(trial)
-        if not new_cost < cost:
-            damping *= 8.0
-            if damping > 1e8:
-                break
-            continue
-        gain, scene, cost = cost - new_cost, trial, new_cost
-        damping = max(damping / 8.0, 1e-9)
-        residual, weight, jacobian = _linearised(scene, seen, blocks, size, huber)
-        if gain <= SMALL_GAIN * cost:
-            break
-    return _finished(scene, seen, blocks, residual, weight, jacobian)
+
+    def expanded(at: Scene) -> _Linear:
+        residual, weight, jacobian = _linearised(at, seen, blocks, size, huber)
+        normal, gradient = _normal(jacobian, residual, weight, at, blocks)
+        return _Linear(_cost(residual, huber) + _prior_cost(at), normal, gradient, residual, weight, jacobian)
+
+    found = minimised(scene, expanded, lambda at, step: _moved(at, blocks, step), STEPS, SMALL_GAIN)
+    return _finished(found.state, seen, blocks, found.at)
+
+
+@dataclass(frozen=True, eq=False)
+class _Linear(Expansion):
+    """With the whitened residuals, their weights and derivatives."""
+
+    residual: Float[Array, "n 2"]
+    weight: Float[Array, " n"]
+    jacobian: sparse.csr_matrix
 
 
 def _finished(
     scene: Scene,
     seen: Observations,
     blocks: Mapping[tuple[str, int], slice],
-    residual: Float[Array, "n 2"],
-    weight: Float[Array, " n"],
-    jacobian: sparse.csr_matrix,
+    at: _Linear,
 ) -> Solved:
-    normal, _ = _normal(jacobian, residual, weight, scene, blocks)
+    normal, residual, weight = at.information, at.residual, at.weight
     scaling = 1.0 / np.sqrt(np.maximum(np.diag(normal), 1e-12))
     scaled = normal * np.outer(scaling, scaling) if len(normal) else np.ones((1, 1))
     values, vectors = np.linalg.eigh(scaled)
     known = sum(values.size for _, values, _ in _known_beforehand(scene))
     spare = max(1.0, 2.0 * float(weight.sum()) + known - len(normal))
-    scale = float(np.sqrt(((weight * (residual**2).sum(axis=1)).sum() + _prior_cost(scene)) / spare))
+    left = float((weight * (residual**2).sum(axis=1)).sum()) + 2 * _prior_cost(scene)
+    scale = float(np.sqrt(left / spare))
     inverse = np.linalg.pinv(normal, hermitian=True, rcond=1e-13)
     worst = int(np.abs(vectors[:, 0]).argmax()) if len(normal) else -1
     named = next((name for name, where in blocks.items() if where.start <= worst < where.stop), ("none", -1))
@@ -180,7 +178,7 @@ def _finished(
         weight,
         inverse * max(scale, 1.0) ** 2,
         blocks,
-        _scores(jacobian, residual, weight, seen),
+        _scores(at.jacobian, residual, weight, seen),
         scale,
         float(values[0]),
         named,
@@ -253,9 +251,7 @@ def _slips(scene: Scene, seen: Observations) -> Float[Array, "n 2"]:
 
 def _cost(residual: Float[Array, "n 2"], huber: float | None) -> float:
     length = np.linalg.norm(residual, axis=1)
-    if huber is None:
-        return float((length**2).sum())
-    return 2 * float(huber_cost(length, huber).sum())
+    return float((0.5 * length**2 if huber is None else huber_cost(length, huber)).sum())
 
 
 def _linearised(
@@ -328,12 +324,7 @@ def _normal(
 
 
 def _prior_cost(scene: Scene) -> float:
-    return sum((float((values**2).sum()) / std**2 for _, values, std in _known_beforehand(scene)), 0.0)
-
-
-def _solve(normal: Float[Array, "u u"], gradient: Float[Array, " u"], damping: float) -> Float[Array, " u"]:
-    damped = normal + np.diag(damping * np.maximum(np.diag(normal), 1e-9))
-    return -np.linalg.solve(damped, gradient)
+    return sum((0.5 * float((values**2).sum()) / std**2 for _, values, std in _known_beforehand(scene)), 0.0)
 
 
 def _moved(scene: Scene, blocks: Mapping[tuple[str, int], slice], step: Float[Array, " u"]) -> Scene:

@@ -23,7 +23,7 @@ from numpy import ndarray as Array
 from scipy import fft
 
 from recordings.constants import MAD_TO_SIGMA
-from recordings.robust import huber_weight
+from recordings.estimation.robust import huber_weight
 
 DICTIONARIES = {
     "tag36h11": (cv2.aruco.DICT_APRILTAG_36H11, 8),

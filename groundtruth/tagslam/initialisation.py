@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -22,7 +23,8 @@ from calibration.cameras.poses import inverse_poses
 from groundtruth import se3
 from groundtruth.factors import CORNERS
 from groundtruth.tagslam.problem import Key, Observation, Problem, camera_key, tag_key
-from recordings.robust import huber_weight
+from recordings.estimation.levenberg_marquardt import Expansion, minimised
+from recordings.estimation.robust import huber_cost, huber_weight
 
 EYE, RIG, BODY, TAG = range(4)
 
@@ -232,24 +234,28 @@ class Initialisation:
     def _refined(
         self, ready: _Ready, x: Float[Array, "4 4"], score: float, agreeing: float
     ) -> tuple[Float[Array, "4 4"], float]:
-        """Gauss-Newton on X with Huber weights at three times the agreeing ones' error; never a worse score."""
+        """X refined with Huber's kernel at three times the agreeing ones' error; never a worse score."""
         in_x = ready.corners_tag_m @ np.swapaxes(ready.right[:, :3, :3], -1, -2) + ready.right[:, None, :3, 3]
         arm = np.concatenate([-se3.skew(in_x), np.broadcast_to(np.eye(3), (*in_x.shape, 3))], -1)
-        best = x
-        for _ in range(self.config.refinements):
-            camera_from_x = ready.left @ best
+
+        def left(at: Array) -> tuple[Array, Array, Array]:
+            camera_from_x = ready.left @ at
             points = in_x @ np.swapaxes(camera_from_x[:, :3, :3], -1, -2) + camera_from_x[:, None, :3, 3]
-            residual = self._project(points, ready.camera) - ready.corners_px
+            return camera_from_x, points, self._project(points, ready.camera) - ready.corners_px
+
+        def expanded(at: Array, reach: float) -> Expansion:
+            camera_from_x, points, residual = left(at)
             size = np.linalg.norm(residual, axis=-1)
-            reach = 3 * max(float(np.quantile(size, agreeing)), 0.3)
-            weight = huber_weight(size, reach)
+            root = np.sqrt(huber_weight(size, reach))[..., None]
             J = self._by_point(points, ready.camera) @ camera_from_x[:, None, :3, :3] @ arm
-            weighted = J * weight[..., None, None]
-            information = np.einsum("nkij,nkil->jl", weighted, J) + 1e-9 * np.eye(6)
-            step = np.linalg.solve(information, -np.einsum("nkij,nki->j", weighted, residual))
-            best = best @ se3.exp(step[None])[0]
-        if not np.isfinite(best).all():
-            return x, score
+            return Expansion.of_residuals(residual * root, J * root[..., None], float(huber_cost(size, reach).sum()))
+
+        best = x
+        for _ in range(2):  # the reach follows what agrees
+            size = np.linalg.norm(left(best)[2], axis=-1)
+            cost = partial(expanded, reach=3 * max(float(np.quantile(size, agreeing)), 0.3))
+            found = minimised(best, cost, lambda at, step: at @ se3.exp(step[None])[0], self.config.refinements, 1e-6)
+            best = found.state
         refined = float(self._scores(ready, best[None], agreeing)[0])
         return (best, refined) if refined <= score else (x, score)
 

@@ -30,13 +30,14 @@ from processing.motion.trajectory import (
     rotation_vectors,
 )
 from recordings.constants import GRAVITY_M_S2
+from recordings.estimation.levenberg_marquardt import Expansion, minimised
 
 FLIGHT_CHANGE_M_S, FLIGHT_CHANGE_RAD_S = 0.004, 0.05
 """What free flight may leave unexplained in the velocities of neighbouring frames (drag, an inertia that is a
 guess)."""
 TOUCH_CHANGE_M_S, TOUCH_CHANGE_RAD_S = 20.0, 400.0
 """Where something touches: nothing is assumed."""
-ROUNDS = 5
+STEPS, LEAST_GAIN = 8, 1e-10
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,6 +101,11 @@ def _factor(information: sparse.sparray, width: int) -> Float[Array, "b n"]:
     return np.asarray(cholesky_banded(bands, lower=True))
 
 
+def _banded(information: sparse.sparray, right: Float[Array, " d"], damping: float) -> Float[Array, " d"]:
+    damped = information + sparse.diags_array(damping * information.diagonal())
+    return np.asarray(cho_solve_banded((_factor(damped, 8), True), right))
+
+
 def _smooth_position(
     series: PoseSeries, noise: Noise, flying: Bool[Array, " m"], resting: Bool[Array, " m"]
 ) -> tuple[Float[Array, "n 3"], Float[Array, "n 3 3"], Float[Array, "n 3 3"]]:
@@ -131,24 +137,27 @@ def _smooth_rotation(
     flying: Bool[Array, " m"],
     resting: Bool[Array, " m"],
 ) -> tuple[Float[Array, "n 3 3"], Float[Array, "n 3 3"], Float[Array, "n 3 3"]]:
-    """Gauss-Newton on R_k exp(d_k). The change of spin is taken as linear in d with the turns between frames as they
-    are (transported to the middle frame), which the rounds correct."""
-    rotation, n = series.rotation.copy(), len(series)
-    sigma = np.where(flying | resting, FLIGHT_CHANGE_RAD_S, TOUCH_CHANGE_RAD_S)
-    dt = np.diff(series.time_s)
-    factor = np.ones((1, 3 * n))
-    for _ in range(ROUNDS):
+    """Least squares over R_k exp(d_k). The change of spin is taken as linear in d with the turns between frames as they
+    are (transported to the middle frame), which further steps correct."""
+    n, dt = len(series), np.diff(series.time_s)
+    sigma = np.repeat(np.where(flying | resting, FLIGHT_CHANGE_RAD_S, TOUCH_CHANGE_RAD_S), 3)
+
+    def expanded(rotation: Float[Array, "n 3 3"]) -> Expansion:
         here = PoseSeries(series.toss, series.time_s, rotation, series.position_m)
         J = _spin_jacobian(rotation, dt)
         change = np.where(flying[:, None], torque_free_change(here, inertia), 0.0)
-        residual = (np.diff(differences(here).spin_object_rad_s[1:], axis=0) - change).ravel()
-        W = sparse.diags_array(1 / np.repeat(sigma, 3) ** 2) @ J
-        moved = rotation_vectors(np.swapaxes(series.rotation, 1, 2) @ rotation).ravel()
-        factor = _factor(sparse.eye_array(3 * n) / noise.rotation_rad**2 + J.T @ W, 8)
-        step = cho_solve_banded((factor, True), -moved / noise.rotation_rad**2 - W.T @ residual)
-        rotation = rotation @ rotation_matrices(step.reshape(n, 3))
-        if np.abs(step).max() < 1e-7:
-            break
+        residual = (np.diff(differences(here).spin_object_rad_s[1:], axis=0) - change).ravel() / sigma
+        W = sparse.diags_array(1 / sigma) @ J
+        moved = rotation_vectors(np.swapaxes(series.rotation, 1, 2) @ rotation).ravel() / noise.rotation_rad
+        information = sparse.eye_array(3 * n) / noise.rotation_rad**2 + W.T @ W
+        cost = 0.5 * float(moved @ moved + residual @ residual)
+        return Expansion(cost, information, moved / noise.rotation_rad + W.T @ residual)
+
+    def moved(rotation: Float[Array, "n 3 3"], step: Float[Array, " d"]) -> Float[Array, "n 3 3"]:
+        return rotation @ rotation_matrices(step.reshape(n, 3))
+
+    found = minimised(series.rotation, expanded, moved, STEPS, LEAST_GAIN, _banded)
+    rotation, factor = found.state, _factor(found.at.information, 8)
     inverse = cho_solve_banded((factor, True), np.eye(3 * n))
     covariance = inverse.reshape(n, 3, n, 3).transpose(0, 2, 1, 3)
     k = np.arange(n - 1)

@@ -18,8 +18,8 @@ from numpy import ndarray as Array
 from processing.motion.tangents import about
 from processing.sensor import noise
 from recordings.constants import MAD_TO_SIGMA
+from recordings.estimation.robust import tukey_weight
 from recordings.geometry import CameraModel, skew
-from recordings.robust import tukey_weight
 from recordings.tracks import ObjectShape
 
 LEAST_SIGMA = (0.002, 0.0003)

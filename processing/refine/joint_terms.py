@@ -18,8 +18,8 @@ from processing.contact.physics.support import trimmed_hull
 from processing.refine.icp import ShapeSurface
 from processing.sensor import noise
 from recordings.constants import GRAVITY_M_S2, MAD_TO_SIGMA
+from recordings.estimation.robust import TUKEY_95, tukey_weight
 from recordings.geometry import rotation_log, skew
-from recordings.robust import TUKEY_95, tukey_weight
 from recordings.tracks import ObjectShape
 
 LEAST_M, LEAST_RAD = 1e-4, 1e-3

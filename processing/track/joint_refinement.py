@@ -25,8 +25,8 @@ from processing.track.depth_error.fields import DepthErrors
 from processing.track.keyframes import view_directions
 from processing.track.pairs import compared
 from processing.track.schedule import Schedule, rows
+from recordings.estimation.robust import geman_mcclure_weight
 from recordings.geometry import rotation_log, skew
-from recordings.robust import geman_mcclure_weight
 
 
 @dataclass(frozen=True)

@@ -30,8 +30,8 @@ from processing.segment.background.foreground import (
 from processing.segment.background.late_depth import LateDepthSettings, unlike_scene
 from processing.segment.background.static_scene import StaticScene
 from recordings.constants import MAD_TO_SIGMA
+from recordings.estimation.robust import TUKEY_95, tukey_weight
 from recordings.records import RgbdFrame
-from recordings.robust import TUKEY_95, tukey_weight
 from recordings.session import RgbdFrames
 
 

@@ -22,10 +22,10 @@ from processing.segment.background.static_scene import StaticScene
 from processing.segment.robot.render import RobotView
 from processing.sensor import noise
 from processing.sensor.noise import stereo_sigma_m
+from recordings.estimation.robust import huber_weight
 from recordings.geometry import CameraModel, Transform, rotation_exp, rotation_log
 from recordings.records import RgbdFrame
 from recordings.robot.arm import ArmPath
-from recordings.robust import huber_weight
 
 DELAY, SCALE = 6, 7
 FINGERS = ("panda_leftfinger", "panda_rightfinger")

@@ -19,7 +19,7 @@ from processing.motion.interpolate import turn_between
 from processing.sensor import view_layout as lay
 from processing.sensor.view_store import ViewStore
 from processing.track.revolution.unwrapping import table_of
-from recordings.robust import tukey_weight
+from recordings.estimation.robust import tukey_weight
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,8 @@ from numpy import ndarray as Array
 
 from processing.sensor import view_layout as lay
 from processing.track.beam import Scene
+from recordings.estimation.robust import geman_mcclure_weight
 from recordings.geometry import rotation_exp
-from recordings.robust import geman_mcclure_weight
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ from processing.track.revolution.azimuth_smoothing import Normal, SteadyConfig, 
 from processing.track.revolution.rolling import Grounded, grounded, sunk
 from processing.track.revolution.unwrapping import Unwrapped, UnwrappingConfig, unwrap, usual_appearance
 from recordings.constants import MAD_TO_SIGMA_SHORT
-from recordings.robust import cauchy_weight
+from recordings.estimation.robust import cauchy_weight
 
 NOT_COMPARED = 1e6
 """Standard deviation of what does not count."""

@@ -20,7 +20,7 @@ from processing.sensor.view_store import ViewStore
 from processing.track.beam import Scene
 from processing.track.revolution.axis import Axis
 from recordings.constants import LUMA, MAD_TO_SIGMA_SHORT
-from recordings.robust import geman_mcclure_weight
+from recordings.estimation.robust import geman_mcclure_weight
 
 
 @dataclass(frozen=True)
