@@ -60,6 +60,7 @@ KERNELS: dict[tuple[str, str], list[tuple[str, ...]]] = {
     ("processing.field.fuse", "_integrate"): [
         (T4, T4, T4, T4, T2, T2, Q4, I8, V4, F4, F4, M4, M4, M4, T4, MB, MB, "uint8[:,:,:]", MB)
     ],
+    ("processing.field.outline", "_add_gaps"): [(T4, V, M, F4, T4, T4)],
     ("processing.sensor.surface_kernel", "fit_surface"): [(M4, MB, V, I8, F8, M4, T4)],
     ("recordings.alignment.kernels", "project"): [(M4, T, V, V, T, M)],
     ("recordings.alignment.kernels", "draw"): [(M4, T, M, M4, V)],

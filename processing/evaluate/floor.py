@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from processing.evaluate.truth import Truth
 
 
-VERSION = 3
+VERSION = 4
 WHERE = "each toss fused at its true poses, rigid ICP"
 
 

@@ -18,6 +18,7 @@ from scipy import ndimage
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from processing.engine.parts import in_parts, side_by_side
+from processing.field.outline import moved_out
 from processing.field.views import FieldView, object_box
 from recordings.tracks import ObjectShape
 
@@ -112,11 +113,16 @@ def fuse(views: Sequence[FieldView], config: FuseConfig, prior_shape: ObjectShap
     rgb = paint[..., :3] / np.maximum(paint[..., 3:], 1e-9)
     grid = Grid(low, voxel_m, config.truncation_m, sdf_m, weight, free, rgb)
     painted = paint[..., 3] > 0
-    if prior_shape is None:
-        fills = (lambda: complete(grid), lambda: replace(grid, rgb=_nearest_color(rgb, painted)))
-        whole, colored = side_by_side(lambda fill: fill(), fills)
-        return replace(whole, rgb=colored.rgb)
-    return _completed_by_prior(grid, prior_shape, painted)
+    if prior_shape is not None:
+        return _outlined(_completed_by_prior(grid, prior_shape, painted), views)
+    fills = (lambda: complete(grid), lambda: replace(grid, rgb=_nearest_color(rgb, painted)))
+    whole, colored = side_by_side(lambda fill: fill(), fills)
+    return _outlined(replace(whole, rgb=colored.rgb), views)
+
+
+def _outlined(grid: Grid, views: Sequence[FieldView]) -> Grid:
+    """The grid with its surface where the masks' outlines touch it."""
+    return replace(grid, sdf_m=moved_out(grid.sdf_m, grid.origin_m, grid.voxel_m, grid.truncation_m, views))
 
 
 def _nearest_color(rgb: Float32[Array, "a b c 3"], known: Bool[Array, "a b c"]) -> Float32[Array, "a b c 3"]:

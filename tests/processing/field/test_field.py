@@ -125,15 +125,21 @@ def test_what_no_view_saw_stays_as_a_shape_is_believed_to_be_and_what_views_saw_
     np.testing.assert_allclose(grid.rgb[tuple(far)], [0, 1, 0], atol=0.01)
 
 
-def test_refinement_pulls_disturbed_poses_back(views):
+def moved_about(views: list[FieldView], by_deg: float, by_m: float) -> list[FieldView]:
+    """The views with poses that are off by so much (standard deviations by axis)."""
     random = np.random.default_rng(3)
     disturbed = []
     for view in views:
         off = np.eye(4)
-        off[:3, :3] = Rotation.from_rotvec(np.radians(0.8) * random.normal(size=3)).as_matrix()
-        off[:3, 3] = 0.001 * random.normal(size=3)
+        off[:3, :3] = Rotation.from_rotvec(np.radians(by_deg) * random.normal(size=3)).as_matrix()
+        off[:3, 3] = by_m * random.normal(size=3)
         pose = view.camera_from_object @ off
         disturbed.append(view.posed(pose, pose))
+    return disturbed
+
+
+def test_refinement_pulls_disturbed_poses_back(views):
+    disturbed = moved_about(views, 0.8, 0.001)
     trained = train_field(disturbed, FieldConfig(steps=0))
     assert spread_deg(trained.views, views) < 0.4 * spread_deg(disturbed, views)
 
@@ -181,7 +187,8 @@ def test_foreign_colour_does_not_reach_the_shape(views):
 def test_a_corner_that_depth_never_tells_of_grows_no_spike():
     """What lies behind one face, and beside the mask wherever it would be seen, is empty."""
     shape = grid_mesh(fuse(cube_views(60, noise_m=0.001), FuseConfig(truncation_m=0.005)))
-    assert distance_to_cube_m(shape.vertices_m).max() < 0.0015
+    pixel_m = 0.35 / CAMERA.K[0, 0]  # outlines tell no more
+    assert distance_to_cube_m(shape.vertices_m).max() < pixel_m
 
 
 def test_the_same_seed_gives_the_same_field(views):
