@@ -242,7 +242,7 @@ def _placed(
     config: D455RefinementConfig,
 ) -> tuple[_Place, float]:
     """The camera's place (a twist on its left), how short edges appear, how late the poses come, and the noise against
-    what is stated: robust Gauss-Newton over all corners at poses that are sure. Also the median distance left."""
+    what is stated: robust least squares over all corners at poses that are sure. Also the median distance left."""
     now = [truths[s.toss].world_from_tagged[s.frame] for s in sure]
     then = [truths[s.toss].soon[s.frame] for s in sure]
     world, soon = (

@@ -68,13 +68,12 @@ def minimised(
     steps: int,
     least_gain: float,
     solved: Solve | None = None,
-    first_damping: float = FIRST_DAMPING,
 ) -> Minimum[State]:
     """The state of least cost near `start`, after at most so many steps, or when one lowers the cost by less than this
     share of it. `solved(H, g, d)` solves the damped equations for -s (default: `dense`); whatever it raises where they
     are singular goes to the caller. A cost that is not a number counts as one that does not fall."""
     solved = solved or dense
-    state, at, damping, tried = start, expanded(start), first_damping, 0
+    state, at, damping, tried = start, expanded(start), FIRST_DAMPING, 0
     while tried < steps and damping <= MOST_DAMPING:
         tried += 1
         candidate = moved(state, -solved(at.information, at.gradient, damping))
