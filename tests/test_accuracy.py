@@ -16,10 +16,10 @@ import trimesh
 from processing.config import Config
 from processing.images import raw_images
 from processing.pipeline.start import start_run
-from processing.stages.find import find_object
+from processing.stages.masks.find import find_object
+from processing.stages.masks.segment import segment
 from processing.stages.recording.rig import refine_rig
 from processing.stages.recording.scene import learn_static_scene
-from processing.stages.segment import segment
 from processing.stages.track import track as track_toss
 from recordings.importers.folder import import_folder
 from recordings.progress import Silent

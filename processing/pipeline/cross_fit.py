@@ -19,6 +19,7 @@ from scipy.special import ndtri
 from processing.images import Images
 from processing.refine.image_residuals import FAR_M, Explained, difference
 from processing.run import Run, each
+from processing.stages.adjust import adjust
 from processing.stages.carry import carry
 from processing.stages.fuse import fuse_frames
 from processing.stages.judge import judge, residuals
@@ -89,9 +90,24 @@ def unbent(run: Run, toss: int, together: Done, alone: Done, images: Images) -> 
     own = carry(run, toss, together, alone) if together.key != alone.key else None
     if own is None or not own.result.frames:
         return together
-    stiff, bent = (on_itself(run, done, images) for done in (own, together))
-    gap = difference(stiff, bent, misfit_of)
-    return own if gap.mean > gap.by_chance and stiff.lost <= bent.lost else together
+    return own if fits_better(run, own, together, images) else together
+
+
+def with_free_surface(run: Run, tracks: Mapping[int, Done], images: Mapping[int, Images]) -> dict[int, Done]:
+    """The tracks after one adjustment of all of them with the surface that they show free; those of tosses that fitted
+    themselves better before, by more than chance, as they were."""
+    shape = fused(run, tracks, images, draft=True)
+    if shape is None:
+        return dict(tracks)
+    after = adjust(run, tracks, shape, images)
+    return each(run, tracks, lambda t: tracks[t] if fits_better(run, tracks[t], after, images[t]) else after)
+
+
+def fits_better(run: Run, one: Done, other: Done, images: Images) -> bool:
+    """Whether a toss's frames fit themselves better at the poses of one track, by more than chance."""
+    first, second = (on_itself(run, done, images) for done in (one, other))
+    gap = difference(first, second, misfit_of)
+    return gap.mean > gap.by_chance and first.lost <= second.lost
 
 
 def own_misfits(run: Run, tracks: Mapping[int, Done], images: Mapping[int, Images]) -> dict[int, float]:

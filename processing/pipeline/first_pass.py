@@ -12,7 +12,7 @@ import numpy as np
 
 from processing.images import Images
 from processing.pipeline import notices as say
-from processing.pipeline.cross_fit import cross_fitted, fused, located_on, sure_alone
+from processing.pipeline.cross_fit import cross_fitted, fused, located_on, sure_alone, with_free_surface
 from processing.pipeline.passes import Pass
 from processing.run import Run, each
 from processing.stages.field import learn_field
@@ -47,6 +47,7 @@ def first_pass(run: Run, alone: Mapping[int, Done], images: Mapping[int, Images]
     found = located(run, images, fitted, {t: alone[t] for t in run.tosses if t not in joined})
     if found:  # the others have not been on a shape with what these show
         fitted = cross_fitted(run, images, {**fitted, **found}, {**alone, **found})
+    fitted = with_free_surface(run, fitted, images)
     left = [t for t in placed.result.not_joined if t not in found]
     own = each(run, left, lambda t: own_shape(run, t, alone[t], images))
     lost = [t for t in left if own[t] is None]

@@ -6,9 +6,9 @@ from collections.abc import Mapping
 
 from processing.backends import SEGMENTERS
 from processing.run import Run, each
-from processing.stages.learn_pixels import learn_pixels
-from processing.stages.learned_masks import learned_masks
-from processing.stages.segment import segment
+from processing.stages.masks.learn_pixels import learn_pixels
+from processing.stages.masks.learned_masks import learned_masks
+from processing.stages.masks.segment import segment
 from processing.store import Done
 
 

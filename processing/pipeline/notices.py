@@ -11,11 +11,11 @@ from processing.run import Run
 from processing.sensor.noise import PUBLISHED
 from processing.stages.field import FieldResult
 from processing.stages.lose import SEE
+from processing.stages.masks.segment import SegmentResult
 from processing.stages.recording.noise import NoiseResult
 from processing.stages.recording.rig import RigResult
 from processing.stages.register import RegisterResult
 from processing.stages.rollout import RolloutResult
-from processing.stages.segment import SegmentResult
 from processing.stages.track import TrackResult
 from processing.store import Done
 from recordings.mcap import arm_codec

@@ -10,12 +10,12 @@ import numpy as np
 from processing.images import TossImages, raw_images
 from processing.run import CAMERA, Run
 from processing.sensor.still import Kept, ThinnedSession
-from processing.stages.find import find_object
 from processing.stages.lose import without_lost
+from processing.stages.masks.find import find_object
+from processing.stages.masks.segment import segment
 from processing.stages.recording.rig import RigResult, refine_rig
 from processing.stages.recording.scene import SceneResult, learn_static_scene
 from processing.stages.recording.still import without_waiting
-from processing.stages.segment import segment
 from processing.store import Done
 
 Step = Callable[[str], None]

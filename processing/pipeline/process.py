@@ -17,8 +17,8 @@ from processing.pipeline.passes import Pass
 from processing.pipeline.record import write_record
 from processing.run import Run, each, with_noise
 from processing.stages.field import learn_field
-from processing.stages.find import find_object
 from processing.stages.lose import without_lost
+from processing.stages.masks.find import find_object
 from processing.stages.model import bring_model
 from processing.stages.recording.depth_delay import with_depth_in_time
 from processing.stages.recording.noise import measure_noise

@@ -11,11 +11,11 @@ from processing.run import Run
 from processing.segment.background.depth_scale import posterior_sigma
 from processing.stages.carry import CarryResult
 from processing.stages.lose import lose
+from processing.stages.masks.segment import SegmentResult
 from processing.stages.recording.every_frame import masks_in_every_frame, poses_in_every_frame
 from processing.stages.recording.rig import RigResult
 from processing.stages.recording.scene import SceneResult, scene_notes
 from processing.stages.register import RegisterResult
-from processing.stages.segment import SegmentResult
 from processing.store import Done, locked
 from processing.variants import Variant
 from recordings.notices import in_order

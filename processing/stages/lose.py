@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from processing.run import CAMERA, Run, toss_keys
-from processing.stages.segment import SegmentResult
+from processing.stages.masks.segment import SegmentResult
 from processing.stages.track import TrackResult
 from processing.store import Done
 from recordings.errors import BadInput

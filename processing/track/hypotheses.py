@@ -275,15 +275,11 @@ def refined(
     fixed = np.arange(all_views) >= n
     fixed[first] = keep_first
     poses = best.poses
-    still = np.array([0 < i < n and use[i] and use[i - 1] and scene.store.stands_still(i - 1, i)
-                      for i in range(all_views)])  # fmt: skip
-    whose = np.maximum(np.arange(all_views) - n + 1, 0)  # a model's views follow each other in no time
-    times_s = np.concatenate([scene.times_s, np.zeros(all_views - n)])
     drawn = np.array([scene.store.usable(i) for i in range(n, all_views)], dtype=bool)
     if _delayed(scene):
         use = use & put_at_color_times(scene, poses[:n], use)
-    center_m = center_of_mass(poses[:n], use, scene)
-    motion = Motion(times_s, whose, scene.gravity_camera_m_s2, center_m, still, _carried(scene, use))
+    motion = motion_of(scene, poses, use)
+    center_m = motion.center_m
     seen = np.concatenate([use, drawn])
     if axis is None:
         joint = refine(scene.store, poses, seen, fixed, motion, config.graph)
@@ -297,6 +293,17 @@ def refined(
     motion_cost = mean_motion_cost(joint.poses[:n], use, scene, center_m, config.motion)
     runs = _held(joint.poses, use, motion, config.graph)
     return TrajectoryHypothesis(best, use, fixed, joint, center_m, motion, float(fit + motion_cost), runs, axis=axis)
+
+
+def motion_of(scene: Scene, poses: Float[Array, "v 4 4"], use: Bool[Array, " n"]) -> Motion:
+    """What is known of how the body moves through the used frames; a model's views follow each other in no time."""
+    n, all_views = len(scene.times_s), len(scene.store)
+    still = np.array([0 < i < n and use[i] and use[i - 1] and scene.store.stands_still(i - 1, i)
+                      for i in range(all_views)])  # fmt: skip
+    whose = np.maximum(np.arange(all_views) - n + 1, 0)
+    times_s = np.concatenate([scene.times_s, np.zeros(all_views - n)])
+    center_m = center_of_mass(poses[:n], use, scene)
+    return Motion(times_s, whose, scene.gravity_camera_m_s2, center_m, still, _carried(scene, use))
 
 
 def own_cost(scene: Scene, hypothesis: TrajectoryHypothesis, config: HypothesisConfig) -> float:

@@ -29,6 +29,7 @@ from recordings.results.stage_files import read_arrays, stage_file
 from recordings.tracks import ObjectShape, ObjectTrack
 
 ALIGNED = "aligned"
+FILLED = "every-frame-"
 FIRST, SECOND, JOINT = "first pass", "pass {}", "joint objective"
 
 
@@ -131,11 +132,21 @@ class _Reader:
 
     def _before(self, toss: int, track: str) -> _Names | None:
         """The pass that a track was refined from: through the frames drawn for it, or where `joint` began."""
-        inputs = self._inputs(track)
-        drawn = self._folder(inputs.get("drawn"))
-        source = self._inputs(drawn) if drawn is not None else inputs if track.startswith("joint-") else {}
+        own = self._unadjusted(toss, self._before_still(toss, track))
+        inputs = self._inputs(own)
+        drawn = own if own.startswith("reproject-") else self._folder(inputs.get("drawn"))
+        source = self._inputs(drawn) if drawn is not None else inputs if own.startswith("joint-") else {}
         earlier = self._folder(source.get(f"track_{toss:02d}"))
         return None if earlier is None else _Names(earlier, self._folder(source.get("shape")), drawn)
+
+    def _unadjusted(self, toss: int, track: str) -> str:
+        """The stage whose poses of a toss a stage has adjusted; else itself."""
+        before = self._folder(self._inputs(track).get(f"track_{toss:02d}"))
+        return before if before is not None and track.startswith("adjust-") else track
+
+    def _before_still(self, toss: int, track: str) -> str:
+        """The stage whose poses were filled up where the object stood still; else itself."""
+        return self._folder(self._inputs(track).get(f"track_{toss:02d}")) or track if FILLED in track else track
 
     def _contact_of(self, toss: int, chain: list[_Names]) -> list[str | None]:
         """The contact stage of every pass: the one whose shape was drawn, or the one that the record names."""
@@ -151,7 +162,8 @@ class _Reader:
 
     def _learned_on(self, contact: str, toss: int, track: str) -> bool:
         key = self._inputs(contact).get(f"track_{toss:02d}")
-        return self._folder(key) == track and self._document(contact).get("counts", {}).get("kept_out") is None
+        whole = self._document(contact).get("counts", {}).get("kept_out") is None
+        return whole and self._folder(key) == self._before_still(toss, track)
 
     def _step(self, toss: int, index: int, chain: list[_Names], contact: list[str | None]) -> Step:
         names, learned = chain[index], contact[index]
@@ -180,6 +192,7 @@ class _Reader:
 
     def _judged(self, toss: int, track: str, shape: str | None) -> Judged | None:
         """Residuals of a shape at a track's poses, where they were taken."""
+        track = self._before_still(toss, track)
         for name in self._judges if shape is not None else ():
             inputs = self._inputs(name)
             wanted = (inputs.get(f"track_{toss:02d}"), inputs.get(f"shape_{toss:02d}"))

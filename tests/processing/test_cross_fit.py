@@ -118,6 +118,28 @@ def test_a_toss_that_drifted_is_put_right_on_the_shape_of_the_other(tiny_world: 
     assert tosses.off_deg(0, fitted[0]) < 2
 
 
+def test_poses_that_drifted_are_put_right_with_the_surface_free(tiny_world: Any, tmp_path: Path) -> None:
+    tosses = Tosses(tiny_world, tmp_path, 2)
+    tracks: Any = {0: tosses.track(0, 0 * TURN, "track-0"), 1: tosses.track(1, 0.5 * TURN, "track-1")}
+    after = cross_fit.with_free_surface(tosses.run, tracks, tosses.images)
+    assert tosses.off_deg(1, tracks[1]) > 4.5
+    assert tosses.off_deg(1, after[1]) < 3.5  # pixels are 4 mm wide here
+    assert tosses.off_deg(0, after[0]) < 2.5
+    one = next(done for done in after.values() if done.key != tracks[1].key)
+    assert one.result.frames == 16
+
+
+def test_a_toss_that_the_adjustment_spoils_stays_as_it_was(
+    tiny_world: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tosses = Tosses(tiny_world, tmp_path, 1, frames=16)
+    right, wrong = tosses.track(0, 0 * TURN, "right"), tosses.track(0, 2 * TURN, "wrong")
+    monkeypatch.setattr(cross_fit, "adjust", lambda *_: wrong)
+    assert cross_fit.with_free_surface(tosses.run, {0: right}, tosses.images) == {0: right}
+    monkeypatch.setattr(cross_fit, "adjust", lambda *_: right)
+    assert cross_fit.with_free_surface(tosses.run, {0: wrong}, tosses.images) == {0: right}
+
+
 @pytest.mark.parametrize(("alone_turn", "bent_turn", "kept"), [(0, 2, "carry"), (2, 0, "bent"), (0, 0, "bent")])
 def test_a_toss_that_registration_bent_is_as_it_was_alone(
     alone_turn: int, bent_turn: int, kept: str, tiny_world: Any, tmp_path: Path

@@ -156,6 +156,7 @@ def test_the_others_are_joined_anew_without_a_toss_that_is_kept_apart(
         return tracks
 
     monkeypatch.setattr(first_pass, "cross_fitted", cross_fitted)
+    monkeypatch.setattr(first_pass, "with_free_surface", lambda _, tracks, __: tracks)
     found = first_pass.first_pass(run, alone, {})
     others = {0: "together [0, 2]", 2: "together [0, 2]"}
     assert {t: d.key for t, d in found.tracks.items()} == (others | {1: "located"} if found_again else others)

@@ -20,11 +20,11 @@ from processing.pipeline.passes import Pass, certain_share
 from processing.pipeline.start import start_run
 from processing.run import Run
 from processing.stages.contact import learn_contact
-from processing.stages.find import find_object
 from processing.stages.held_out import Half, halves_of, judge_by_contact, losses_of, why_not_by_contact
+from processing.stages.masks.find import find_object
+from processing.stages.masks.segment import segment
 from processing.stages.recording.rig import refine_rig
 from processing.stages.recording.scene import learn_static_scene
-from processing.stages.segment import segment
 from processing.store import Done
 from recordings.progress import Silent
 from recordings.results.folder import read_shape, read_track, write_shape, write_track

@@ -23,10 +23,10 @@ from processing.field.train import FieldConfig
 from processing.pipeline import notices
 from processing.run import Run
 from processing.sensor.noise import PUBLISHED
+from processing.stages.masks.segment import SegmentResult
 from processing.stages.recording.noise import NoiseResult
 from processing.stages.recording.rig import RigResult
 from processing.stages.register import RegisterResult
-from processing.stages.segment import SegmentResult
 from processing.stages.track import TrackResult
 from processing.store import Done
 from recordings.importers.folder import import_folder

@@ -25,11 +25,11 @@ from processing.segment.background.depth_delay import (
 from processing.segment.background.static_scene import StaticScene
 from processing.sensor.depth_stamps import with_depth_later
 from processing.sensor.still import StillSettings, ThinnedSession, kept_of
-from processing.stages.find import find_object
+from processing.stages.masks.find import find_object
+from processing.stages.masks.segment import segment
 from processing.stages.recording.depth_delay import with_depth_in_time
 from processing.stages.recording.rig import refine_rig
 from processing.stages.recording.scene import learn_static_scene
-from processing.stages.segment import segment
 from recordings.geometry import Transform, rotation_exp, rotation_log
 from recordings.progress import Silent
 from recordings.records import RgbdFrame

@@ -27,7 +27,7 @@ from processing.segment.detect.detection import (
 )
 from processing.segment.detect.tracklets import Appearance, TrackletSettings, choose, free_fall, join
 from processing.stages.lose import without_lost
-from processing.stages.segment import SegmentResult
+from processing.stages.masks.segment import SegmentResult
 from processing.store import Done
 from recordings.errors import BadInput
 from recordings.progress import Silent

@@ -18,7 +18,7 @@ from processing.segment.background.static_scene import StaticScene
 from processing.segment.learned.again import AgainSettings, Judged, found_again, overlap, support_of
 from processing.segment.learned.masks import LearnedSettings, Look, look, redrawn, sizes_px
 from processing.segment.learned.network import NetworkSettings, PixelNetwork, learned, samples_of
-from processing.stages.find import find_object
+from processing.stages.masks.find import find_object
 from processing.stages.recording.rig import refine_rig
 from processing.stages.recording.scene import learn_static_scene
 from processing.variants import TRACKERS

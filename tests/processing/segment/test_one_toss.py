@@ -23,10 +23,10 @@ from processing.segment.background.static_scene import (
     learn_scene,
     seen_table_depth,
 )
-from processing.stages.find import find_object
+from processing.stages.masks.find import find_object
+from processing.stages.masks.segment import segment
 from processing.stages.recording.rig import refine_rig
 from processing.stages.recording.scene import learn_static_scene, scene_notes
-from processing.stages.segment import segment
 from recordings.errors import DamagedFile
 from recordings.geometry import rotation_exp
 from recordings.progress import Silent

@@ -27,10 +27,10 @@ from processing.segment.robot.frames import RobotFrames, RobotSettings, with_rob
 from processing.segment.robot.of_session import Rig, RobotOfSession
 from processing.segment.robot.render import RobotView
 from processing.sensor.frames import corrected_depth, metric_frames
-from processing.stages.find import find_object
+from processing.stages.masks.find import find_object
+from processing.stages.masks.segment import segment
 from processing.stages.recording.rig import refine_rig
 from processing.stages.recording.scene import learn_static_scene
-from processing.stages.segment import segment
 from recordings.geometry import CameraModel, Transform, rotation_exp, rotation_log
 from recordings.progress import Silent
 from recordings.records import ArmStates, RgbdFrame

@@ -113,6 +113,26 @@ def test_the_passes_are_found_by_their_keys_the_first_one_first(tiny: Any, cycle
     np.testing.assert_allclose([first.judged.depth_m[0], second.judged.depth_m[0]], [0.002, 0.001])
 
 
+def test_passes_are_found_through_adjusted_poses_and_through_frames_filled_up(
+    tiny: Any, cycled: Path, tmp_path: Path
+) -> None:
+    own, adjusted, filled = tmp_path / "results", "adjust-33333333", "every-frame-44444444"
+    shutil.copytree(cycled, own)
+    last = Results.open(own).find()
+    for stage, inputs in ((adjusted, {"track_00": DRAWN, "surface": LEARNED}), (filled, {"track_00": adjusted})):
+        shutil.copytree(own / TRACK, own / stage, ignore=shutil.ignore_patterns("stage.json"))
+        document = {"key": key(stage), "inputs": {k: key(v) for k, v in inputs.items()}, "counts": {}}
+        (own / stage / "stage.json").write_text(json.dumps(document))
+    shutil.rmtree(own / JUDGE_2)
+    judged = write_stage(own, JUDGE_2, {"track_00": adjusted, "shape_00": SHAPE})
+    np.savez(judged / "residuals.npz", rows=np.array([[0, 0, 0.001, 0.05, 9.0]]))
+    write_variant(own, replace(last, tosses=(replace(last.tosses[0], track=filled),)))
+    first, second = cycle_of(own).steps
+    assert (first.label, second.label) == ("first pass", "pass 2")
+    assert first.laid.verdict[REJECTED] == "poor fit"
+    np.testing.assert_allclose([first.judged.depth_m[0], second.judged.depth_m[0]], [0.002, 0.001])
+
+
 def test_a_contact_shape_that_was_kept_out_is_shown_beside_the_one_that_was_drawn(
     tiny: Any, session: Path, tmp_path: Path
 ) -> None:

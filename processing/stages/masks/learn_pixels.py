@@ -15,7 +15,7 @@ from processing.segment.background.static_scene import StaticScene
 from processing.segment.learned.masks import half_of, sizes_px
 from processing.segment.learned.network import learned, samples_of
 from processing.segment.learned.toss_looks import TossLooks
-from processing.stages.segment import SegmentResult
+from processing.stages.masks.segment import SegmentResult
 from processing.store import Done, plain
 from recordings.results.folder import RobotMasks, read_masks
 

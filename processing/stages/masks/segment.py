@@ -14,7 +14,7 @@ from processing.segment.background.segmenter import BackgroundSegmenter
 from processing.segment.background.static_scene import StaticScene
 from processing.segment.detect.detection import Detection, read_detection
 from processing.segment.robot.of_session import Rig
-from processing.stages.find import FindResult, example, given_masks, robot_frames, toss_with_mask
+from processing.stages.masks.find import FindResult, example, given_masks, robot_frames, toss_with_mask
 from processing.stages.recording.rig import RigResult
 from processing.store import Done
 from recordings.results.folder import write_hand, write_masks

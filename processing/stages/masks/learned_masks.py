@@ -14,9 +14,9 @@ from processing.run import Run, toss_keys
 from processing.segment.learned.again import Judged, found_again
 from processing.segment.learned.masks import half_of, redrawn
 from processing.segment.learned.network import PixelNetwork
-from processing.stages.find import given_masks
-from processing.stages.learn_pixels import HALVES, PixelsResult, mask_settings, toss_looks
-from processing.stages.segment import SegmentResult
+from processing.stages.masks.find import given_masks
+from processing.stages.masks.learn_pixels import HALVES, PixelsResult, mask_settings, toss_looks
+from processing.stages.masks.segment import SegmentResult
 from processing.store import Done
 from recordings.results.folder import write_masks
 from recordings.results.stage_files import read_arrays

@@ -1,0 +1,65 @@
+"""Stage `adjust`: the poses of all tosses, adjusted with the surface free that their frames show together."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from processing.engine.parts import side_by_side
+from processing.features.sift import Sift
+from processing.images import Images, track_and_image_keys
+from processing.motion.motion_prior import gravity_in_camera
+from processing.run import Run
+from processing.store import Done
+from processing.track.beam import Scene, seconds
+from processing.track.free_surface.adjust import PosedToss, adjusted
+from processing.track.known_shape import center_of
+from processing.track.track_toss import views_of
+from recordings.geometry import rotation_angle_rad
+from recordings.progress import Silent
+from recordings.results.folder import read_shape, read_track, write_track
+
+VERSION = 1
+
+
+@dataclass(frozen=True)
+class AdjustResult:
+    """Frames with a pose, and how far they moved (medians)."""
+
+    frames: int
+    rotation_deg: float
+    translation_m: float
+
+
+def adjust(run: Run, tracks: Mapping[int, Done], shape: Done, images: Mapping[int, Images]) -> Done[AdjustResult]:
+    """The tracks of tosses in the object frame of `shape`. How sure each pose is stays as its track had it: that the
+    surface holds it as well is not counted."""
+    inputs = {**track_and_image_keys(tracks, images), "surface": shape.key}
+
+    def compute(folder: Path) -> AdjustResult:
+        body, before = read_shape(shape.folder), {t: read_track(done.folder, t) for t, done in tracks.items()}
+        gravity = gravity_in_camera(None if run.world_from_camera is None else run.world_from_camera.matrix)
+
+        def opened(toss: int) -> PosedToss:
+            seen = images[toss].open()
+            store, times_ns, _ = views_of(
+                seen.frames, seen.masks, run.camera, seen.confidence, run.config.track, run.world_from_camera, Silent(),
+                colorless=seen.colorless,
+            )  # fmt: skip
+            scene = Scene(store, seconds(times_ns), gravity, center_of(body), Sift(), hand=seen.hand)
+            return PosedToss(scene, before[toss].camera_from_object)
+
+        tosses = list(side_by_side(opened, list(tracks)))
+        poses = adjusted(tosses, body, run.config.track.hypotheses, run.progress("poses with the surface free"))
+        turns, shifts = [], []
+        for (_, track), after in zip(before.items(), poses, strict=True):
+            steps = np.linalg.inv(track.camera_from_object[~track.lost]) @ after[~track.lost]
+            turns += [float(np.degrees(rotation_angle_rad(step[:3, :3]))) for step in steps]
+            shifts += [float(x) for x in np.linalg.norm(steps[:, :3, 3], axis=1)]
+            write_track(folder, replace(track, camera_from_object=after))
+        return AdjustResult(len(turns), float(np.median(turns or [0.0])), float(np.median(shifts or [0.0])))
+
+    return run.store.run("adjust", VERSION, run.config.track.hypotheses, inputs, AdjustResult, compute)

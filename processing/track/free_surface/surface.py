@@ -1,0 +1,91 @@
+"""A shape whose surface is unknown along its normals: an offset for each small patch of it, smooth over the patches."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Int
+from numpy import ndarray as Array
+from scipy.spatial import cKDTree
+
+from processing.sensor.render import RaycastRenderer
+from recordings.geometry import CameraModel
+from recordings.tracks import ObjectShape
+
+PATCH_M, PATCHES_ACROSS = 0.006, 25
+"""Width of a patch, and so many across a larger body: finer ones cost time and change nothing (choose-003)."""
+OFFSET_SIGMA_M = 0.005
+"""How far a fused surface may be off (standard deviation): by about what fused depth of `choose` closes in by."""
+SMOOTH_SIGMA_M = 0.0007
+"""... and by how much neighbouring patches of one face differ in it; .0003 gives the same poses."""
+MOST_POINTS = 200
+"""Of an outline, evenly along it."""
+
+
+class FreeSurface:
+    """The patches of a shape (object frame), and what is known of their `count` offsets before anything is measured:
+    `prior`, an inverse covariance (1/m^2)."""
+
+    def __init__(self, shape: ObjectShape, pinhole: CameraModel) -> None:
+        """`pinhole`: the camera, rectified."""
+        self._shape, self._renderer = shape, RaycastRenderer(shape, pinhole)
+        self.vertices_m, self.normals = shape.vertices_m, _vertex_normals(shape)
+        size_m = float(np.linalg.norm(np.ptp(shape.vertices_m, axis=0)))
+        self.patch = _patches(shape.vertices_m, self.normals, max(PATCH_M, size_m / PATCHES_ACROSS))
+        """Of each vertex."""
+        self.count = int(self.patch.max()) + 1
+        mean = np.stack([np.bincount(self.patch, axis, self.count) for axis in self.normals.T], -1)
+        self.patch_normals = mean / np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-9)
+        self.prior = _smooth(shape.faces, self.patch, self.patch_normals) + np.eye(self.count) / OFFSET_SIGMA_M**2
+        self._tree = cKDTree(shape.vertices_m)
+
+    def nearest(self, points_m: Float[Array, "n 3"]) -> tuple[Float[Array, " n"], Int[Array, " n"]]:
+        """Distance (m) to the nearest vertex, and which it is."""
+        distance_m, vertex = self._tree.query(points_m)
+        return np.asarray(distance_m), np.asarray(vertex)
+
+    def outline(self, camera_from_object: Float[Array, "4 4"]) -> tuple[Float[Array, "n 3"], Int[Array, " n"], float]:
+        """What the outline of the shape at a pose is made of: points of the surface (object frame, m), each one's
+        nearest vertex, and how many pixels of the outline a point stands for. Parts that no view saw are left out."""
+        depth_m, face, within = self._renderer.hits(camera_from_object)
+        body = depth_m > 0
+        cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
+        inner = cv2.erode(body.astype(np.uint8), cross) > 0  # where the image cuts the body off is inner
+        v, u = np.nonzero(body & ~inner)
+        if self._shape.observed is not None:
+            seen = self._shape.observed[self._shape.faces[face[v, u]]].all(-1)
+            v, u = v[seen], u[seen]
+        some = np.unique(np.linspace(0, len(v) - 1, MOST_POINTS).astype(int)) if len(v) else np.zeros(0, dtype=int)
+        share, v, u = len(v) / max(len(some), 1), v[some], u[some]
+        corners = self._shape.faces[face[v, u]]
+        points = np.einsum("nc,ncj->nj", within[v, u].astype(np.float64), self.vertices_m[corners])
+        return points, corners[:, 0], share
+
+
+def _vertex_normals(shape: ObjectShape) -> Float[Array, "v 3"]:
+    """Outward, of unit length."""
+    import trimesh
+
+    mesh = trimesh.Trimesh(shape.vertices_m, shape.faces, process=False)
+    return np.array(mesh.vertex_normals, dtype=np.float64)
+
+
+def _patches(vertices_m: Float[Array, "v 3"], normals: Float[Array, "v 3"], width_m: float) -> Int[Array, " v"]:
+    """Patch of each vertex: those in one cell of a grid that face alike (by the axis that they face most)."""
+    cell = np.floor(vertices_m / width_m).astype(np.int64)
+    axis = np.abs(normals).argmax(1)
+    side = 2 * axis + (normals[np.arange(len(normals)), axis] > 0)
+    return np.unique(np.column_stack([cell, side]), axis=0, return_inverse=True)[1].reshape(-1)
+
+
+def _smooth(
+    faces: Int[Array, "f 3"], patch: Int[Array, " v"], normals: Float[Array, "k 3"]
+) -> Float[Array, "k k"]:  # fmt: skip
+    """Inverse covariance by which patches that touch, and face alike, have like offsets."""
+    out = np.zeros((len(normals), len(normals)))
+    touch = np.unique(np.sort(patch[faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)], axis=1), axis=0)
+    a, b = touch[touch[:, 0] != touch[:, 1]].T
+    alike = np.maximum(np.einsum("nj,nj->n", normals[a], normals[b]), 0) ** 2 / SMOOTH_SIGMA_M**2
+    for row, column, sign in ((a, a, 1), (b, b, 1), (a, b, -1), (b, a, -1)):
+        np.add.at(out, (row, column), sign * alike)
+    return out
