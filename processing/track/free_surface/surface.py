@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from numpy import ndarray as Array
 from scipy.spatial import cKDTree
 
@@ -48,10 +48,7 @@ class FreeSurface:
         """What the outline of the shape at a pose is made of: points of the surface (object frame, m), each one's
         nearest vertex, and how many pixels of the outline a point stands for. Parts that no view saw are left out."""
         depth_m, face, within = self._renderer.hits(camera_from_object)
-        body = depth_m > 0
-        cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
-        inner = cv2.erode(body.astype(np.uint8), cross) > 0  # where the image cuts the body off is inner
-        v, u = np.nonzero(body & ~inner)
+        v, u = _border(depth_m > 0)
         if self._shape.observed is not None:
             seen = self._shape.observed[self._shape.faces[face[v, u]]].all(-1)
             v, u = v[seen], u[seen]
@@ -60,6 +57,18 @@ class FreeSurface:
         corners = self._shape.faces[face[v, u]]
         points = np.einsum("nc,ncj->nj", within[v, u].astype(np.float64), self.vertices_m[corners])
         return points, corners[:, 0], share
+
+
+def _border(body: Bool[Array, "h w"]) -> tuple[Int[Array, " n"], Int[Array, " n"]]:
+    """Rows and columns of its pixels that have a neighbour which is not; where the image ends, it goes on."""
+    rows, columns = np.flatnonzero(body.any(1)), np.flatnonzero(body.any(0))
+    if len(rows) == 0:
+        return rows, columns
+    top, left = max(rows[0] - 1, 0), max(columns[0] - 1, 0)
+    part = body[top : rows[-1] + 2, left : columns[-1] + 2]
+    inner = cv2.erode(part.astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))) > 0
+    v, u = np.nonzero(part & ~inner)
+    return v + top, u + left
 
 
 def _vertex_normals(shape: ObjectShape) -> Float[Array, "v 3"]:
