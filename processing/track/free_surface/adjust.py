@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float
 from numpy import ndarray as Array
 from scipy.linalg import cho_factor, cho_solve
 
+from processing.sensor.noise import ADJUST_PAIRS_PER_MEASUREMENT
 from processing.track.beam import Scene
 from processing.track.depth_color_offset import put_at_color_times
 from processing.track.free_surface.surface import FreeSurface
@@ -46,7 +47,8 @@ def adjusted(
     for each, there, use in zip(measured, poses, used):
         each.learn({int(i): each.of(int(i), there[i])[0] for i in np.flatnonzero(use)}, offsets_m)
     said = [_said(*each) for each in zip(measured, poses, used)]
-    graph = replace(config.graph, schedule=config.finest, depth_errors=config.depth_noise)
+    graph = replace(config.graph, schedule=config.finest, depth_errors=config.depth_noise,
+                    shared_noise=ADJUST_PAIRS_PER_MEASUREMENT)  # fmt: skip
     for t, toss in enumerate(tosses):
         if used[t].any():
             others = np.sum(said, axis=0) - said[t]
