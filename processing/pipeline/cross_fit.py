@@ -90,24 +90,25 @@ def unbent(run: Run, toss: int, together: Done, alone: Done, images: Images) -> 
     own = carry(run, toss, together, alone) if together.key != alone.key else None
     if own is None or not own.result.frames:
         return together
-    return own if fits_better(run, own, together, images) else together
+    stiff, bent = (on_itself(run, done, images) for done in (own, together))
+    gap = difference(stiff, bent, misfit_of)
+    return own if gap.mean > gap.by_chance and stiff.lost <= bent.lost else together
 
 
 def with_free_surface(run: Run, tracks: Mapping[int, Done], images: Mapping[int, Images]) -> dict[int, Done]:
-    """The tracks after one adjustment of all of them with the surface that they show free; those of tosses that fitted
-    themselves better before, by more than chance, as they were."""
+    """The tracks after one adjustment of all of them with the surface that they show free; those of tosses that surely
+    fitted themselves better before, as they were."""
     shape = fused(run, tracks, images, draft=True)
     if shape is None:
         return dict(tracks)
     after = adjust(run, tracks, shape, images)
-    return each(run, tracks, lambda t: tracks[t] if fits_better(run, tracks[t], after, images[t]) else after)
 
+    def stays(toss: int) -> bool:
+        was, now = (TrackResiduals(on_itself(run, done, images[toss]), None) for done in (tracks[toss], after))
+        return was.surely_better(now)
 
-def fits_better(run: Run, one: Done, other: Done, images: Images) -> bool:
-    """Whether a toss's frames fit themselves better at the poses of one track, by more than chance."""
-    first, second = (on_itself(run, done, images) for done in (one, other))
-    gap = difference(first, second, misfit_of)
-    return gap.mean > gap.by_chance and first.lost <= second.lost
+    kept = each(run, tracks, stays)
+    return {t: done if kept[t] else after for t, done in tracks.items()}
 
 
 def own_misfits(run: Run, tracks: Mapping[int, Done], images: Mapping[int, Images]) -> dict[int, float]:
