@@ -90,6 +90,7 @@ def noisy_views(geometry):
     return [geometry.view(true, geometry.tilted(rng, (0.5, 0.8), 0.05), rng) for _ in range(12)]
 
 
+@pytest.mark.slow
 def test_a_lens_drawn_to_noise_is_refused_and_never_chosen_where_another_will_do(noisy_views):
     asked = calibrate_intrinsics("mono0", (640, 480), noisy_views, ("rational",))
     assert unsupported(asked.model) is not None
@@ -132,6 +133,7 @@ def corner_views(geometry, true, rng):
     return middle, geometry.view(true, far, rng)
 
 
+@pytest.mark.slow
 def test_a_corner_of_the_image_that_no_view_reached_is_explained_better_than_by_plain_opencv(geometry):
     """Where k3 is hardly told it is held back: fitted to the noise, it bends what lies farther out by pixels."""
     true = geometry.camera("mono0", 620.0, distortion_model="brown-conrady", distortion=(-0.17, 0.03, 0.0, 0.0, 0.0))

@@ -354,6 +354,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.slow
 def test_two_jobs_leave_the_same_bytes_as_one(record_tiny: Any, tmp_path: Path) -> None:
     (tmp_path / "rows.py").write_text(QUICK_ROWS)
     command = [sys.executable, str(tmp_path / "rows.py"), str(record_tiny(frames=6)), str(tmp_path), str(TOOLS)]
