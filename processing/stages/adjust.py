@@ -55,7 +55,7 @@ def adjust(run: Run, tracks: Mapping[int, Done], shape: Done, images: Mapping[in
         tosses = list(side_by_side(opened, list(tracks)))
         poses = adjusted(tosses, body, run.config.track.hypotheses, run.progress("poses with the surface free"))
         turns, shifts = [], []
-        for (_, track), after in zip(before.items(), poses, strict=True):
+        for track, after in zip(before.values(), poses, strict=True):
             steps = np.linalg.inv(track.camera_from_object[~track.lost]) @ after[~track.lost]
             turns += [float(np.degrees(rotation_angle_rad(step[:3, :3]))) for step in steps]
             shifts += [float(x) for x in np.linalg.norm(steps[:, :3, 3], axis=1)]

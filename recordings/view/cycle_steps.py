@@ -146,7 +146,8 @@ class _Reader:
 
     def _before_still(self, toss: int, track: str) -> str:
         """The stage whose poses were filled up where the object stood still; else itself."""
-        return self._folder(self._inputs(track).get(f"track_{toss:02d}")) or track if FILLED in track else track
+        before = self._folder(self._inputs(track).get(f"track_{toss:02d}"))
+        return before if before is not None and track.startswith(FILLED) else track
 
     def _contact_of(self, toss: int, chain: list[_Names]) -> list[str | None]:
         """The contact stage of every pass: the one whose shape was drawn, or the one that the record names."""

@@ -15,7 +15,8 @@ from recordings.tracks import ObjectShape
 PATCH_M, PATCHES_ACROSS = 0.006, 25
 """Width of a patch, and so many across a larger body: finer ones cost time and change nothing (choose-003)."""
 OFFSET_SIGMA_M = 0.005
-"""How far a fused surface may be off (standard deviation): by about what fused depth of `choose` closes in by."""
+"""How far a fused surface may be off (standard deviation). Not swept; by their volumes three sessions (choose-008, the
+former judge-013 and 021) were 2 to 4 mm too small before outlines moved them out."""
 SMOOTH_SIGMA_M = 0.0007
 """... and by how much neighbouring patches of one face differ in it; .0003 gives the same poses."""
 MOST_POINTS = 200

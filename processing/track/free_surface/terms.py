@@ -179,7 +179,7 @@ class SurfaceTerms:
         """Adds the views' normal equations, the surface's offsets eliminated."""
         count = self._measured.surface.count
         said = self._others
-        couplings, places, outlines = [], [], dict[int, Residuals]()
+        couplings, free, outlines = [], [], dict[int, Residuals]()
         for i in self._free:
             both = self._measured.of(i, poses[i])
             outlines[i] = both[0]
@@ -193,18 +193,15 @@ class SurfaceTerms:
                 coupling += [np.bincount(r.patch, column, count) for column in (weighted * r.by_offset[:, None]).T]
             if place[i] >= 0:
                 couplings.append(coupling)
-                places.append(int(place[i]))
+                free.append(int(place[i]))
         factor = cho_factor(self._measured.surface.prior + np.diag(said[0]), lower=True)
         offsets_m = -cho_solve(factor, said[1])
         self._measured.learn(outlines, offsets_m)
-        if places:
-            C = np.concatenate(couplings)
+        if free:
+            C, places = np.concatenate(couplings), np.array(free)
             shared = (C @ cho_solve(factor, C.T)).reshape(len(places), 6, len(places), 6).transpose(0, 2, 1, 3)
-            moved = (C @ offsets_m).reshape(-1, 6)
-            for a, one in enumerate(places):  # views may share a place
-                g[one] += moved[a]
-                for b, other in enumerate(places):
-                    H[one, other] -= shared[a, b]
+            np.subtract.at(H, (places[:, None], places[None]), shared)
+            np.add.at(g, places, (C @ offsets_m).reshape(-1, 6))
 
 
 def signed_distance_px(mask: Bool[Array, "h w"]) -> Float32[Array, "h w"]:
