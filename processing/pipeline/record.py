@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Mapping
 
 from processing.pipeline import notices as say
@@ -33,9 +34,11 @@ def write_record(
     scale_sigma, first = posterior_sigma(rig.result.scale_sigma, run.config.rig.scale), min(last.tracks)
     moved = posed_together(last.tracks, alone)
     on_shape = {t: alone[t] for t in moved if not isinstance(last.tracks[t].result, (RegisterResult, CarryResult))}
+    held = on_shape.keys() & sharing(last.tracks)
 
     def of_toss(t: int) -> TossRecord:
-        poses = poses_in_every_frame(run, t, tracks[t], (first, tracks[first]), scale_sigma, on_shape.get(t))
+        before, drifts = on_shape.get(t), t not in held
+        poses = poses_in_every_frame(run, t, tracks[t], (first, tracks[first]), scale_sigma, before, drifts)
         return TossRecord(t, poses.name, shapes[t].name, masks_in_every_frame(run, t, masks[t]).name)
 
     tosses = tuple(of_toss(t) for t in run.recorded)
@@ -72,3 +75,10 @@ def posed_together(tracks: Mapping[int, Done], alone: Mapping[int, Done]) -> lis
     """Tosses whose poses are another stage's than their first pass, but for those without any."""
     moved = [t for t, done in alone.items() if t in tracks and tracks[t].key != done.key]
     return [t for t in moved if not read_track(tracks[t].folder, t).lost.all()]
+
+
+def sharing(tracks: Mapping[int, Done]) -> set[int]:
+    """Tosses with poses in an object frame that another one has poses in, too."""
+    posed = {t: track for t, track in ((t, read_track(d.folder, t)) for t, d in tracks.items()) if not track.lost.all()}
+    count = Counter(track.object_frame for track in posed.values())
+    return {t for t, track in posed.items() if count[track.object_frame] > 1}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +15,7 @@ from processing.motion.motion_prior import gravity_in_camera
 from processing.run import Run
 from processing.store import Done
 from processing.track.beam import Scene, seconds
+from processing.track.flags import reflagged
 from processing.track.free_surface.adjust import PosedToss, adjusted
 from processing.track.known_shape import center_of
 from processing.track.track_toss import views_of
@@ -22,7 +23,7 @@ from recordings.geometry import rotation_angle_rad
 from recordings.progress import Silent
 from recordings.results.folder import read_shape, read_track, write_track
 
-VERSION = 2
+VERSION = 3
 
 
 @dataclass(frozen=True)
@@ -35,8 +36,7 @@ class AdjustResult:
 
 
 def adjust(run: Run, tracks: Mapping[int, Done], shape: Done, images: Mapping[int, Images]) -> Done[AdjustResult]:
-    """The tracks of tosses in the object frame of `shape`. How sure each pose is stays as its track had it: that the
-    surface holds it as well is not counted."""
+    """The tracks of tosses in the object frame of `shape`."""
     inputs = {**track_and_image_keys(tracks, images), "surface": shape.key}
 
     def compute(folder: Path) -> AdjustResult:
@@ -53,13 +53,14 @@ def adjust(run: Run, tracks: Mapping[int, Done], shape: Done, images: Mapping[in
             return PosedToss(scene, before[toss].camera_from_object)
 
         tosses = list(side_by_side(opened, list(tracks)))
-        poses = adjusted(tosses, body, run.config.track.hypotheses, run.progress("poses with the surface free"))
+        config = run.config.track
+        all_after = adjusted(tosses, body, config.hypotheses, run.progress("poses with the surface free"))
         turns, shifts = [], []
-        for track, after in zip(before.values(), poses, strict=True):
-            steps = np.linalg.inv(track.camera_from_object[~track.lost]) @ after[~track.lost]
+        for track, after in zip(before.values(), all_after, strict=True):
+            steps = np.linalg.inv(track.camera_from_object[~track.lost]) @ after.poses[~track.lost]
             turns += [float(np.degrees(rotation_angle_rad(step[:3, :3]))) for step in steps]
             shifts += [float(x) for x in np.linalg.norm(steps[:, :3, 3], axis=1)]
-            write_track(folder, replace(track, camera_from_object=after))
+            write_track(folder, reflagged(track, after.poses, after.covariance, after.cost, config.flags))
         return AdjustResult(len(turns), float(np.median(turns or [0.0])), float(np.median(shifts or [0.0])))
 
-    return run.store.run("adjust", VERSION, run.config.track.hypotheses, inputs, AdjustResult, compute)
+    return run.store.run("adjust", VERSION, run.config.track, inputs, AdjustResult, compute)

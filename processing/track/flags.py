@@ -9,6 +9,7 @@ from itertools import groupby
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray as Array
+from scipy.special import ndtri
 
 from processing.motion.interpolate import between
 from processing.sensor import noise
@@ -179,6 +180,20 @@ def flagged(
     return out, tuple(status), sigma  # type: ignore[arg-type]
 
 
+def reflagged(
+    track: ObjectTrack, poses: Float[Array, "n 4 4"], twists: Float[Array, "n 6 6"], cost: Float[Array, " n"],
+    config: FlagConfig,
+) -> ObjectTrack:  # fmt: skip
+    """The track at poses that were solved for anew, with their covariances (twist of the object frame) and what each
+    view costs there; frames that took no part (NaN), or fit nothing, are as unsure as they were."""
+    status, covariance = list(track.status), track.covariance.copy()
+    for i in np.flatnonzero(~track.lost & (cost <= config.tracked_cost)):
+        covariance[i] = camera_covariance(poses[i], config.correlated * twists[i])
+        unsure = np.linalg.eigvalsh(covariance[i, :3, :3])[-1] > np.radians(config.unsure_deg) ** 2
+        status[i] = "interpolated" if unsure else "tracked"
+    return replace(track, camera_from_object=poses, covariance=covariance, status=tuple(status))
+
+
 def _in_gap(
     poses: Float[Array, "n 4 4"], before: Int[Array, " a"], after: Int[Array, " b"], i: int, scene: Scene
 ) -> Float[Array, "4 4"]:
@@ -195,9 +210,11 @@ def _in_gap(
 
 
 SURE_DEG, SURE_M = 5.0, 0.02
-"""What a published `tracked` promises: root mean squares of the angle and of the distance by which a pose is off, over
-all three axes, below these, of which the first is the field's limit of a right pose (5 degrees, 5 cm). Inside, surer
-than `FlagConfig.unsure_deg` will do."""
+"""What a published `tracked` promises: an angle and a distance by which a pose is off below these, of which the first
+is the field's limit of a right pose (5 degrees, 5 cm). Inside, surer than `FlagConfig.unsure_deg` will do."""
+SURE_SIGMAS = float(ndtri(0.975))
+"""A Gaussian error about or along one axis is below so many standard deviations 95 times in a hundred; the length of
+one over three axes, in units of its root mean square, oftener."""
 
 
 def with_shape_error(track: ObjectTrack, alone: ObjectTrack) -> ObjectTrack:
@@ -223,21 +240,22 @@ def with_shape_error(track: ObjectTrack, alone: ObjectTrack) -> ObjectTrack:
 
 
 def with_drift(track: ObjectTrack, coarseness: float) -> ObjectTrack:
-    """The track, its covariances as many times as large as means over the session's depth vary more than over fine
-    depth (`DepthNoise.coarseness`).
+    """The track of a toss that rests on nothing but its own frames, its covariances as many times as large as means
+    over the session's depth vary more than over fine depth (`DepthNoise.coarseness`).
 
     The joint refinement knows how depth errs. But where it is coarse, chains of views slip, each pair of which still
-    fits, and no covariance about one solution shows it.
+    fits, and no covariance about one solution shows it. What other tosses show of the object ends such chains.
     """
     return replace(track, covariance=track.covariance * max(1.0, coarseness))
 
 
 def published(track: ObjectTrack) -> ObjectTrack:
-    """The track, `tracked` only where it is as sure as that promises; what is not known of a covariance is no doubt."""
+    """The track, `tracked` only where it keeps what that promises by `SURE_SIGMAS`; what is not known of a covariance
+    is no doubt."""
     status = list(track.status)
     for i, covariance in enumerate(track.covariance):
         if status[i] == "tracked" and np.isfinite(covariance).all():
-            turn, place = (np.trace(covariance[a : a + 3, a : a + 3]) for a in (0, 3))
+            turn, place = (SURE_SIGMAS**2 * np.trace(covariance[a : a + 3, a : a + 3]) for a in (0, 3))
             if turn > np.radians(SURE_DEG) ** 2 or place > SURE_M**2:
                 status[i] = "interpolated"
     return replace(track, status=tuple(status))

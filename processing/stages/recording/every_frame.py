@@ -21,7 +21,7 @@ from recordings.results.folder import RobotMasks, read_masks, read_track, write_
 from recordings.results.track_notes import FIT, NOTES
 from recordings.tracks import ObjectTrack
 
-VERSION = 8
+VERSION = 9
 
 
 @dataclass(frozen=True)
@@ -33,21 +33,23 @@ class EveryFrameResult:
 
 
 def poses_in_every_frame(
-    run: Run, toss: int, done: Done, first: tuple[int, Done], scale_sigma: float, alone: Done | None
+    run: Run, toss: int, done: Done, first: tuple[int, Done], scale_sigma: float, alone: Done | None, drifts: bool
 ) -> Done:
     """A stage's track of one toss in every frame that was recorded. `first`: the toss that comes first, and its track;
     `scale_sigma`: standard deviation of depth's scale; `alone`: the toss's first pass, where the track rests on a shape
-    that was fused from first passes. What the tracker noted of its frames goes with it where
-    these are all frames."""
+    that was fused from first passes; `drifts`: whether no other toss's frames hold it. What the tracker noted of its
+    frames goes with it where these are all frames."""
     kept = run.kept.get(toss)
     inputs = {f"track_{toss:02d}": done.key} if kept is None else {"thinned": done.key, "kept": kept.digest}
     inputs |= {"first": first[1].key} | ({} if alone is None else {"alone": alone.key})
+
+    drift = run.noise.coarseness if drifts else 1.0
 
     def compute(folder: Path) -> EveryFrameResult:
         track = read_track(done.folder, toss)
         if alone is not None:
             track = with_shape_error(track, read_track(alone.folder, toss))
-        track = with_drift(track, run.noise.coarseness)
+        track = with_drift(track, drift)
         defined = defining_pose(track, read_track(first[1].folder, first[0]))
         count = len(track.status)
         if kept is None:
@@ -62,7 +64,7 @@ def poses_in_every_frame(
         write_track(folder, published(scaled_by_chance(track, defined, scale_sigma)))
         return EveryFrameResult(len(track.status), count)
 
-    config = {"toss": toss, "first": first[0], "scale_sigma": scale_sigma, "coarseness": run.noise.coarseness}
+    config = {"toss": toss, "first": first[0], "scale_sigma": scale_sigma, "drift": drift}
     return _stage(run, config, inputs, compute)
 
 

@@ -17,6 +17,7 @@ from scipy.linalg import cho_factor, cho_solve
 from processing.sensor.noise import ADJUST_PAIRS_PER_MEASUREMENT
 from processing.track.beam import Scene
 from processing.track.depth_color_offset import put_at_color_times
+from processing.track.flags import per_view
 from processing.track.free_surface.surface import FreeSurface
 from processing.track.free_surface.terms import SurfaceMeasurements, SurfaceTerms
 from processing.track.hypotheses import HypothesisConfig, motion_of
@@ -33,11 +34,21 @@ class PosedToss:
     poses: Float[Array, "n 4 4"]
 
 
+@dataclass(frozen=True, eq=False)
+class AdjustedToss:
+    """Poses after the adjustment, their covariances (twist of the object frame, translation first) with the surface's
+    own doubt in them, and how badly each view fits its neighbours (NaN where it took no part: it is as it was)."""
+
+    poses: Float[Array, "n 4 4"]
+    covariance: Float[Array, "n 6 6"]
+    cost: Float[Array, " n"]
+
+
 def adjusted(
     tosses: Sequence[PosedToss], shape: ObjectShape, config: HypothesisConfig, progress: Progress
-) -> list[Float[Array, "n 4 4"]]:
-    """The poses of tosses after they were refined with what all of them show of the shape's surface. Frames without a
-    pose, or that show too little, stay as they are."""
+) -> list[AdjustedToss]:
+    """Tosses after they were refined with what all of them show of the shape's surface. Frames without a pose, or that
+    show too little, stay as they are."""
     surface = FreeSurface(shape, tosses[0].scene.store.rectified.camera)
     poses, used = [t.poses.copy() for t in tosses], [_used(t) for t in tosses]
     measured = [SurfaceMeasurements(surface, t.scene.store, config.depth_noise) for t in tosses]
@@ -49,16 +60,21 @@ def adjusted(
     said = [_said(*each) for each in zip(measured, poses, used)]
     graph = replace(config.graph, schedule=config.finest, depth_errors=config.depth_noise,
                     shared_noise=ADJUST_PAIRS_PER_MEASUREMENT)  # fmt: skip
+    after = []
     for t, toss in enumerate(tosses):
+        spread, cost = np.full((len(poses[t]), 6, 6), np.nan), np.full(len(poses[t]), np.nan)
         if used[t].any():
             others = np.sum(said, axis=0) - said[t]
             terms = SurfaceTerms(measured[t], np.flatnonzero(used[t]), others)
             motion = motion_of(toss.scene, poses[t], used[t])
             none = np.zeros(len(used[t]), dtype=bool)
-            poses[t] = refine(toss.scene.store, poses[t], used[t], none, motion, graph, priors=(terms,)).poses
+            joint = refine(toss.scene.store, poses[t], used[t], none, motion, graph, priors=(terms,))
+            poses[t], spread[used[t]] = joint.poses, joint.covariance[used[t]]
+            cost[used[t]] = per_view(joint.pairs, joint.figures, len(cost))[0][used[t]]
             said[t] = _said(measured[t], poses[t], used[t])
+        after.append(AdjustedToss(poses[t], spread, cost))
         progress.step(t + 1, len(tosses), "tosses")
-    return poses
+    return after
 
 
 def _used(toss: PosedToss) -> Bool[Array, " n"]:

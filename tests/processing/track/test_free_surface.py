@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from processing.features.sift import Sift
 from processing.motion import se3_kernels as se3
-from processing.sensor.noise import DepthNoise
+from processing.sensor.noise import TRACK_COVARIANCE_SCALE, DepthNoise
 from processing.sensor.render import RaycastRenderer
 from processing.sensor.view import Crop
 from processing.track.beam import Scene
@@ -153,15 +153,22 @@ def test_poses_that_drift_come_to_one_surface(tosses, smaller_m, left):
     found = adjusted(posed, ellipsoid(smaller_m), config, Silent())
     for seed, start, end in zip((1, 2), starts, found):
         assert apart_deg(start, true_poses(seed)).mean() == pytest.approx(2.0)
-        assert apart_deg(end, true_poses(seed)).mean() < left * 2.0
+        assert apart_deg(end.poses, true_poses(seed)).mean() < left * 2.0
+        variance = TRACK_COVARIANCE_SCALE * np.trace(end.covariance[:, 3:, 3:], axis1=1, axis2=2)
+        claimed_deg = np.degrees(np.sqrt(variance))
+        assert np.sqrt(np.mean((apart_deg(end.poses, true_poses(seed)) / claimed_deg) ** 2)) < 1.0
+        assert claimed_deg.max() < 6.0  # and the claim says something: of a body without texture
 
 
 def test_frames_without_a_pose_stay_so(tosses):
     poses = true_poses(1)
     poses[3] = np.nan
     found = adjusted([PosedToss(tosses[0], poses)], ellipsoid(), HypothesisConfig(depth_noise=NOISE), Silent())
-    assert np.isnan(found[0][3]).all()
-    assert np.isfinite(np.delete(found[0], 3, axis=0)).all()
+    (one,) = found
+    assert np.isnan(one.poses[3]).all()
+    assert np.isnan(one.covariance[3]).all()
+    assert np.isnan(one.cost[3])
+    assert all(np.isfinite(np.delete(x, 3, axis=0)).all() for x in (one.poses, one.covariance, one.cost))
 
 
 def test_distances_to_an_outline_are_half_a_pixel_on_either_side():
