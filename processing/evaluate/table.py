@@ -129,8 +129,8 @@ def _legend(rows: Sequence[dict[str, Any]]) -> list[str]:
     there = {name for row in rows for name in row["values"]}
     lines = [
         "All frames of these tosses count; a lost one has an infinite error, also in a toss that is lost end to end. "
-        f"Unsure (`interpolated`): a pose of which its covariance does not say with 95 % that it is off by less than "
-        f"{SURE_DEG:g} deg and {100 * SURE_M:g} cm.",
+        f"Unsure (`interpolated`): a pose that its covariance takes to be off by more than {SURE_DEG:g} deg or "
+        f"{100 * SURE_M:g} cm (root mean square).",
         "Poses are aligned per toss at its own first frame; a toss whose first frame is lost is not aligned. CD icp: "
         "after a further rigid alignment of the mesh.",
     ]

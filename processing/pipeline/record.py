@@ -37,8 +37,8 @@ def write_record(
     held = on_shape.keys() & sharing(last.tracks)
 
     def of_toss(t: int) -> TossRecord:
-        before, drifts = on_shape.get(t), t not in held
-        poses = poses_in_every_frame(run, t, tracks[t], (first, tracks[first]), scale_sigma, before, drifts)
+        before = on_shape.get(t)
+        poses = poses_in_every_frame(run, t, tracks[t], (first, tracks[first]), scale_sigma, before, t in held)
         return TossRecord(t, poses.name, shapes[t].name, masks_in_every_frame(run, t, masks[t]).name)
 
     tosses = tuple(of_toss(t) for t in run.recorded)

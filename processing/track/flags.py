@@ -9,7 +9,6 @@ from itertools import groupby
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray as Array
-from scipy.special import ndtri
 
 from processing.motion.interpolate import between
 from processing.sensor import noise
@@ -210,11 +209,9 @@ def _in_gap(
 
 
 SURE_DEG, SURE_M = 5.0, 0.02
-"""What a published `tracked` promises: an angle and a distance by which a pose is off below these, of which the first
-is the field's limit of a right pose (5 degrees, 5 cm). Inside, surer than `FlagConfig.unsure_deg` will do."""
-SURE_SIGMAS = float(ndtri(0.975))
-"""A Gaussian error about or along one axis is below so many standard deviations 95 times in a hundred; the length of
-one over three axes, in units of its root mean square, oftener."""
+"""What a published `tracked` promises: root mean squares of the angle and of the distance by which a pose is off, over
+all three axes, below these, of which the first is the field's limit of a right pose (5 degrees, 5 cm). Inside, surer
+than `FlagConfig.unsure_deg` will do."""
 
 
 def with_shape_error(track: ObjectTrack, alone: ObjectTrack) -> ObjectTrack:
@@ -239,23 +236,26 @@ def with_shape_error(track: ObjectTrack, alone: ObjectTrack) -> ObjectTrack:
     return replace(track, covariance=covariance)
 
 
-def with_drift(track: ObjectTrack, coarseness: float) -> ObjectTrack:
-    """The track of a toss that rests on nothing but its own frames, its covariances as many times as large as means
-    over the session's depth vary more than over fine depth (`DepthNoise.coarseness`).
+HELD_DRIFT = 0.5
+"""Power of the drift that other tosses leave: docs/decisions/tracked.md has the curve."""
+
+
+def with_drift(track: ObjectTrack, coarseness: float, held: bool) -> ObjectTrack:
+    """The track, its covariances as many times as large as means over the session's depth vary more than over fine
+    depth (`DepthNoise.coarseness`); by its root where other tosses' frames hold it.
 
     The joint refinement knows how depth errs. But where it is coarse, chains of views slip, each pair of which still
-    fits, and no covariance about one solution shows it. What other tosses show of the object ends such chains.
+    fits, and no covariance about one solution shows it. What other tosses show of the object ends most such chains.
     """
-    return replace(track, covariance=track.covariance * max(1.0, coarseness))
+    return replace(track, covariance=track.covariance * max(1.0, coarseness) ** (HELD_DRIFT if held else 1.0))
 
 
 def published(track: ObjectTrack) -> ObjectTrack:
-    """The track, `tracked` only where it keeps what that promises by `SURE_SIGMAS`; what is not known of a covariance
-    is no doubt."""
+    """The track, `tracked` only where it is as sure as that promises; what is not known of a covariance is no doubt."""
     status = list(track.status)
     for i, covariance in enumerate(track.covariance):
         if status[i] == "tracked" and np.isfinite(covariance).all():
-            turn, place = (SURE_SIGMAS**2 * np.trace(covariance[a : a + 3, a : a + 3]) for a in (0, 3))
+            turn, place = (np.trace(covariance[a : a + 3, a : a + 3]) for a in (0, 3))
             if turn > np.radians(SURE_DEG) ** 2 or place > SURE_M**2:
                 status[i] = "interpolated"
     return replace(track, status=tuple(status))

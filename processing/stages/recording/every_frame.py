@@ -33,23 +33,21 @@ class EveryFrameResult:
 
 
 def poses_in_every_frame(
-    run: Run, toss: int, done: Done, first: tuple[int, Done], scale_sigma: float, alone: Done | None, drifts: bool
+    run: Run, toss: int, done: Done, first: tuple[int, Done], scale_sigma: float, alone: Done | None, held: bool
 ) -> Done:
     """A stage's track of one toss in every frame that was recorded. `first`: the toss that comes first, and its track;
     `scale_sigma`: standard deviation of depth's scale; `alone`: the toss's first pass, where the track rests on a shape
-    that was fused from first passes; `drifts`: whether no other toss's frames hold it. What the tracker noted of its
+    that was fused from first passes; `held`: whether other tosses' frames hold it. What the tracker noted of its
     frames goes with it where these are all frames."""
     kept = run.kept.get(toss)
     inputs = {f"track_{toss:02d}": done.key} if kept is None else {"thinned": done.key, "kept": kept.digest}
     inputs |= {"first": first[1].key} | ({} if alone is None else {"alone": alone.key})
 
-    drift = run.noise.coarseness if drifts else 1.0
-
     def compute(folder: Path) -> EveryFrameResult:
         track = read_track(done.folder, toss)
         if alone is not None:
             track = with_shape_error(track, read_track(alone.folder, toss))
-        track = with_drift(track, drift)
+        track = with_drift(track, run.noise.coarseness, held)
         defined = defining_pose(track, read_track(first[1].folder, first[0]))
         count = len(track.status)
         if kept is None:
@@ -64,7 +62,8 @@ def poses_in_every_frame(
         write_track(folder, published(scaled_by_chance(track, defined, scale_sigma)))
         return EveryFrameResult(len(track.status), count)
 
-    config = {"toss": toss, "first": first[0], "scale_sigma": scale_sigma, "drift": drift}
+    config = {"toss": toss, "first": first[0], "scale_sigma": scale_sigma, "coarseness": run.noise.coarseness}
+    config |= {"held": held}
     return _stage(run, config, inputs, compute)
 
 
