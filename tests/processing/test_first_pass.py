@@ -97,7 +97,6 @@ def test_where_no_frame_of_any_toss_is_sure_the_shape_is_a_guess_and_said_to_be(
     together, images = stages(tiny_world, run, tmp_path, None, unsure=session.tosses)
     placed = replace(together, result=RegisterResult((), (), ()))
     monkeypatch.setattr(first_pass, "register", lambda *_: placed)
-    monkeypatch.setattr(first_pass, "with_free_surface", lambda _run, tracks, _images: tracks)  # would be sure of them
     alone = {t: replace(together, result=TrackResult(4, 4, 0)) for t in run.tosses}
     found = first_pass.first_pass(run, alone, images)
     assert found.shape.result.views == 8
