@@ -184,9 +184,11 @@ def reflagged(
     config: FlagConfig,
 ) -> ObjectTrack:  # fmt: skip
     """The track at poses that were solved for anew, with their covariances (twist of the object frame) and what each
-    view costs there; frames that took no part (NaN), or fit nothing, are as unsure as they were."""
+    view costs there. Frames that took no part (NaN), fit nothing, or were unsure are as unsure as they were: no
+    covariance about one solution knows of another one."""
     status, covariance = list(track.status), track.covariance.copy()
-    for i in np.flatnonzero(~track.lost & (cost <= config.tracked_cost)):
+    sure = np.array([s == "tracked" for s in status])
+    for i in np.flatnonzero(sure & (cost <= config.tracked_cost)):
         covariance[i] = camera_covariance(poses[i], config.correlated * twists[i])
         unsure = np.linalg.eigvalsh(covariance[i, :3, :3])[-1] > np.radians(config.unsure_deg) ** 2
         status[i] = "interpolated" if unsure else "tracked"

@@ -117,22 +117,22 @@ def test_a_wrong_mask_of_a_frame_or_two_contradicts_no_pose() -> None:
 
 
 def test_poses_that_were_solved_for_anew_are_as_sure_as_their_new_covariances() -> None:
-    """Frames: sure now; unsure now; fits nothing; took no part; lost."""
-    config, n = FlagConfig(), 5
+    """Frames: sure; unsure now; fits nothing; took no part; lost; unsure before."""
+    config, n = FlagConfig(), 6
     poses = np.tile(np.eye(4), (n, 1, 1))
     poses[4] = np.nan
     covariance = np.full((n, 6, 6), np.nan)
-    covariance[:4] = 0.3**2 * np.eye(6)
-    status = ("interpolated", "tracked", "interpolated", "tracked", "lost")
+    covariance[[0, 1, 2, 3, 5]] = 0.3**2 * np.eye(6)
+    status = ("tracked", "tracked", "tracked", "tracked", "lost", "interpolated")
     before = ObjectTrack(0, "d455", "object", np.arange(n, dtype=np.int64), poses, status, covariance)
     after = poses.copy()
-    after[:4, :3, :3] = rotation_exp(np.array([0.1, 0.2, -0.3]))
+    after[[0, 1, 2, 3, 5], :3, :3] = rotation_exp(np.array([0.1, 0.2, -0.3]))
     twists = np.full((n, 6, 6), np.nan)
-    twists[:3] = np.diag([1e-3, 2e-3, 3e-3, 0.01, 0.02, 0.03]) ** 2
+    twists[[0, 1, 2, 5]] = np.diag([1e-3, 2e-3, 3e-3, 0.01, 0.02, 0.03]) ** 2
     twists[1, 3, 3] = 1.0
-    cost = np.array([0.1, 0.1, 1.1 * config.tracked_cost, np.nan, np.nan])
+    cost = np.array([0.1, 0.1, 1.1 * config.tracked_cost, np.nan, np.nan, 0.1])
     found = reflagged(before, after, twists, cost, config)
-    assert found.status == ("tracked", "interpolated", "interpolated", "tracked", "lost")
+    assert found.status == ("tracked", "interpolated", "tracked", "tracked", "lost", "interpolated")
     np.testing.assert_array_equal(found.camera_from_object, after)
     np.testing.assert_allclose(found.covariance[0], camera_covariance(after[0], config.correlated * twists[0]))
     np.testing.assert_array_equal(found.covariance[2:], covariance[2:])
