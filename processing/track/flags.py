@@ -164,8 +164,7 @@ def flagged(
     tracked = np.flatnonzero(~lost)
     for i in tracked:
         sigma[i] = camera_covariance(poses[i], covariance[i])
-        if np.linalg.eigvalsh(sigma[i, :3, :3])[-1] > np.radians(config.unsure_deg) ** 2:
-            status[i] = "interpolated"
+        status[i] = _status(sigma[i], config)
     for i in np.flatnonzero(lost):
         out[i], status[i] = np.nan, "lost"
         before, after = tracked[tracked < i], tracked[tracked > i]
@@ -179,6 +178,12 @@ def flagged(
     return out, tuple(status), sigma  # type: ignore[arg-type]
 
 
+def _status(covariance: Float[Array, "6 6"], config: FlagConfig) -> Status:
+    """What a pose is called within a run, by its covariance in camera axes."""
+    unsure = np.linalg.eigvalsh(covariance[:3, :3])[-1] > np.radians(config.unsure_deg) ** 2
+    return "interpolated" if unsure else "tracked"
+
+
 def reflagged(
     track: ObjectTrack, poses: Float[Array, "n 4 4"], twists: Float[Array, "n 6 6"], cost: Float[Array, " n"],
     config: FlagConfig,
@@ -190,8 +195,7 @@ def reflagged(
     sure = np.array([s == "tracked" for s in status])
     for i in np.flatnonzero(sure & (cost <= config.tracked_cost)):
         covariance[i] = camera_covariance(poses[i], config.correlated * twists[i])
-        unsure = np.linalg.eigvalsh(covariance[i, :3, :3])[-1] > np.radians(config.unsure_deg) ** 2
-        status[i] = "interpolated" if unsure else "tracked"
+        status[i] = _status(covariance[i], config)
     return replace(track, camera_from_object=poses, covariance=covariance, status=tuple(status))
 
 
