@@ -47,7 +47,8 @@ class FlagConfig:
     outside_share: float = 0.1
     """Views of which more lies outside the other's outline contradict each other ..."""
     contradicting: int = 3
-    """... as poses, where so many in a row do: a mask may be wrong for a frame or two."""
+    """... as poses, where so many in a row do: a mask may be wrong for a frame or two. As few unsure ones in a row are
+    unsure by themselves."""
     unsure_deg: float = 15.0
     """A pose whose rotation may be off by more than this (standard deviation) is a guess, marked as interpolated: a
     flip (45 degrees) lies within three of them."""
@@ -189,11 +190,15 @@ def reflagged(
     config: FlagConfig,
 ) -> ObjectTrack:  # fmt: skip
     """The track at poses that were solved for anew, with their covariances (twist of the object frame) and what each
-    view costs there. Frames that took no part (NaN), fit nothing, or were unsure are as unsure as they were: no
-    covariance about one solution knows of another one."""
+    view costs there. Frames that took no part (NaN) or fit nothing are as unsure as they were; and so are one or two
+    unsure ones among others, whose doubt is their own (an impact). How a longer run lies to the sure ones, all see."""
     status, covariance = list(track.status), track.covariance.copy()
-    sure = np.array([s == "tracked" for s in status])
-    for i in np.flatnonzero(sure & (cost <= config.tracked_cost)):
+    least = config.contradicting if "tracked" in status else len(status) + 1
+    doubted = []
+    for unsure, run in groupby(s != "tracked" for s in status):
+        length = len(list(run))
+        doubted += [unsure and length < least] * length
+    for i in np.flatnonzero(~np.array(doubted) & (cost <= config.tracked_cost)):
         covariance[i] = camera_covariance(poses[i], config.correlated * twists[i])
         status[i] = _status(covariance[i], config)
     return replace(track, camera_from_object=poses, covariance=covariance, status=tuple(status))
