@@ -29,9 +29,10 @@ class FlagConfig:
     """A view that costs more no pose explains: one rigid body fits better, however it looks."""
     longest_gap_s: float = 0.2
     """Frames between tracked ones that are at most this far apart get an interpolated pose."""
-    gap_sigma_rad: float = 0.15
+    gap_sigma_rad: float = 0.75
     gap_sigma_m: float = 0.02
-    """Standard deviation of an interpolated pose in the middle of the longest gap."""
+    """Standard deviation of an interpolated pose in the middle of the longest gap. Most gaps are impacts, which change
+    the spin: single frames of three sessions, .07 s between tracked ones, are 20, 30 and 32 degrees off."""
     correlated: float = noise.TRACK_COVARIANCE_SCALE
     rival_cost: float = 0.0015
     """Another hypothesis of the same frames that costs more by this much counts half towards the uncertainty."""
@@ -225,12 +226,19 @@ all three axes, below these, of which the first is the field's limit of a right 
 than `FlagConfig.unsure_deg` will do."""
 
 
-def with_shape_error(track: ObjectTrack, alone: ObjectTrack) -> ObjectTrack:
+HELD_SHAPE_DEG = 3.0
+"""So far tosses lie turned to each other that one shape explains (root mean square over seven generated sessions: 2.6).
+docs/decisions/tracked.md has the curve."""
+
+
+def with_shape_error(track: ObjectTrack, alone: ObjectTrack, held: bool) -> ObjectTrack:
     """The track of a toss on a shape, its covariances with the error of that shape.
 
     The shape was fused from the tosses' first passes (`alone`: this toss's) and repeats their errors, so that no
     alignment to it takes them away. Nor does the mean of several tosses: where each view's depth is taken for the
-    surface, all err alike. Frames that were lost alone are as unsure as its others in the mean.
+    surface, all err alike. Frames that were lost alone are as unsure as its others in the mean. Of a toss that others
+    hold no more than `HELD_SHAPE_DEG` (of the axis that is known least) is added: which of its hypotheses is right, by
+    which a toss alone may be unsure by any angle, their frames have decided.
     """
     posed = ~track.lost
     known = posed & ~alone.lost & np.isfinite(alone.covariance).all(axis=(1, 2))
@@ -239,8 +247,12 @@ def with_shape_error(track: ObjectTrack, alone: ObjectTrack) -> ObjectTrack:
     to = np.tile(np.eye(6), (int(known.sum()), 1, 1))  # both frames' origins are fixed to the body
     lever = track.camera_from_object[known, :3, 3] - alone.camera_from_object[known, :3, 3]
     to[:, 3:, :3] = [-skew(arm) for arm in lever]
+    own = alone.covariance[known]
+    if held:
+        worst = np.linalg.eigvalsh(own[:, :3, :3])[:, -1, None, None]
+        own = own * np.minimum(1.0, np.radians(HELD_SHAPE_DEG) ** 2 / np.maximum(worst, 1e-12))
     errors = np.empty_like(track.covariance)
-    errors[known] = to @ alone.covariance[known] @ to.transpose(0, 2, 1)
+    errors[known] = to @ own @ to.transpose(0, 2, 1)
     errors[~known] = errors[known].mean(axis=0)
     covariance = track.covariance.copy()
     covariance[posed] += errors[posed]

@@ -15,6 +15,7 @@ from processing.sensor.noise import FINE, DepthNoise
 from processing.stages.recording.every_frame import defining_pose, scaled_by_chance
 from processing.store import Done
 from processing.track.flags import (
+    HELD_SHAPE_DEG,
     SURE_DEG,
     SURE_M,
     camera_covariance,
@@ -123,7 +124,7 @@ def test_on_a_shape_a_track_is_as_unsure_as_the_first_passes_that_made_it() -> N
         turn, shift = error[:3], error[3:]
         lever = (pose @ frame_from_own)[:3, 3] - pose[:3, 3]
         errors[k] = np.r_[turn, shift + rotation_exp(turn) @ lever - lever]
-    claimed = with_shape_error(on_shape, alone).covariance[3]
+    claimed = with_shape_error(on_shape, alone, held=False).covariance[3]
     scale = np.sqrt(np.outer(claimed.diagonal(), claimed.diagonal()))
     np.testing.assert_allclose(claimed / scale, np.cov(errors.T) / scale, atol=0.08)
 
@@ -133,12 +134,26 @@ def test_what_was_lost_alone_is_as_unsure_as_the_rest_in_the_mean_and_lost_poses
     poses = alone.camera_from_object.copy()
     poses[7] = poses[6]
     on_shape = replace(alone, camera_from_object=poses, status=("tracked",) * FRAMES)
-    grown = with_shape_error(on_shape, alone).covariance - on_shape.covariance
+    grown = with_shape_error(on_shape, alone, held=False).covariance - on_shape.covariance
     np.testing.assert_allclose(grown[7], grown[np.arange(FRAMES) != 7].mean(axis=0), atol=1e-15)
-    still_lost = with_shape_error(alone, alone)
+    still_lost = with_shape_error(alone, alone, held=False)
     np.testing.assert_array_equal(still_lost.covariance[7], alone.covariance[7])
     nowhere = ObjectTrack.nowhere(0, "d455", alone.time_ns)
-    assert with_shape_error(alone, nowhere) is alone
+    assert with_shape_error(alone, nowhere, held=False) is alone
+
+
+def test_a_toss_that_others_hold_is_no_surer_than_its_shape_and_no_less_sure_by_other_hypotheses() -> None:
+    alone = true_track()
+    known = ~alone.lost
+    sigma_rad = np.where(np.arange(FRAMES) % 2, np.radians(0.4 * HELD_SHAPE_DEG), np.radians(60.0))
+    alone = replace(alone, covariance=np.where(known[:, None, None], sigma_rad[:, None, None] ** 2 * np.eye(6), np.nan))
+    on_shape = replace(alone, covariance=0 * alone.covariance)
+    held, by_itself = (with_shape_error(on_shape, alone, held=h).covariance[known] for h in (True, False))
+    turn = np.sqrt(held[:, :3, :3].diagonal(axis1=1, axis2=2))
+    np.testing.assert_allclose(
+        turn, np.radians(np.where(np.flatnonzero(known) % 2, 0.4, 1.0) * HELD_SHAPE_DEG)[:, None] * np.ones(3)
+    )
+    np.testing.assert_allclose(by_itself, alone.covariance[known])
 
 
 def test_in_coarse_depth_poses_are_as_much_less_sure_as_means_over_it_and_in_fine_depth_no_surer() -> None:

@@ -21,7 +21,7 @@ from recordings.results.folder import RobotMasks, read_masks, read_track, write_
 from recordings.results.track_notes import FIT, NOTES
 from recordings.tracks import ObjectTrack
 
-VERSION = 9
+VERSION = 10
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ def poses_in_every_frame(
     def compute(folder: Path) -> EveryFrameResult:
         track = read_track(done.folder, toss)
         if alone is not None:
-            track = with_shape_error(track, read_track(alone.folder, toss))
+            track = with_shape_error(track, read_track(alone.folder, toss), held)
         track = with_drift(track, run.noise.coarseness, held)
         defined = defining_pose(track, read_track(first[1].folder, first[0]))
         count = len(track.status)
