@@ -52,8 +52,8 @@ class FlagConfig:
     unsure by themselves."""
     confirmed_sigmas: float = 3.0
     """A run of unsure frames that a second solution turned by more of its standard deviations (median) is contradicted
-    by it. Runs of `choose` sessions: three turned by 3.1 to 5.8 (two were wrong), ten by .8 to 2.7 (four were right, one
-    by half, four are of round bodies' turns about their axes, which all their frames have wrong)."""
+    by it. Runs of `choose` sessions: three turned by 3.1 to 5.8 (two were wrong), ten by .8 to 2.7 (four were right,
+    one by half, four are of round bodies' turns about their axes, which all their frames have wrong)."""
     unsure_deg: float = 15.0
     """A pose whose rotation may be off by more than this (standard deviation) is a guess, marked as interpolated: a
     flip (45 degrees) lies within three of them."""
