@@ -114,7 +114,7 @@ def _work(args: argparse.Namespace) -> Outcome:
         if out.exists():
             replace_folder(out)
         out.parent.mkdir(parents=True, exist_ok=True)
-        document = write_session_truth(session, truth, out, offset, args.mesh)
+        document = write_session_truth(truth, out, offset, args.mesh)
     verdict = truth.verdict
     text = _text(document, verdict, notes, out)
     return Outcome({"out": out, **document, "notes": notes}, text, DONE if verdict.good else FELL_SHORT)

@@ -215,7 +215,7 @@ def fit_mesh(truth: SessionTruth, mesh_path: Path) -> Fit:
 
 
 def write_session_truth(
-    session: Session, truth: SessionTruth, out: Path, object_from_tagged: Transform | None, mesh_path: Path | None
+    truth: SessionTruth, out: Path, object_from_tagged: Transform | None, mesh_path: Path | None
 ) -> dict[str, Any]:
     """truth.json, toss_XX.mcap, mesh.obj and tags/ into the new folder `out`; returns truth.json's document."""
     poses = {toss: _stamped(t) for toss, t in truth.tosses.items()}

@@ -79,7 +79,7 @@ def _fit(
     s = np.linspace(-1 + 2 * NEAREST_TO_CORNER, 1 - 2 * NEAREST_TO_CORNER, ALONG)
     d = edges.reach[:, None] * np.linspace(-1, 1, ACROSS)
     seen = _sampled(image, edges, s, d)
-    fit = _start(seen, s, edges.reach)
+    fit = _start(seen, edges.reach)
     for _ in range(STEPS):
         residual, jacobian = _model(fit, s, d, seen)
         normal = np.einsum("enk,enl->ekl", jacobian, jacobian)
@@ -124,7 +124,7 @@ def _sampled(
     return out.reshape(len(d), len(s), d.shape[1]).astype(np.float64)
 
 
-def _start(seen: Float[Array, "e a c"], s: Float[Array, " a"], reach: Float[Array, " e"]) -> Float[Array, "e 7"]:
+def _start(seen: Float[Array, "e a c"], reach: Float[Array, " e"]) -> Float[Array, "e 7"]:
     fit = np.zeros((len(seen), 7))
     fit[:, 2] = np.log(0.3 * reach)
     fit[:, 3] = seen[:, :, :2].mean(axis=(1, 2))

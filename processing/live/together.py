@@ -75,7 +75,7 @@ class Together:
         inertia = np.eye(3) * 1e-3 if self.shape is None else uniform_physics(self.shape).inertia_kgm2
         instants = instants_of(moved.track, self.world_from_camera, moved.center_m, inertia, looked.window)
         joined = Joined(
-            looked=replace(looked, views=_moved_views(looked, moved.track, placement)),
+            looked=replace(looked, views=_moved_views(looked, placement)),
             track=moved.track,
             compared=thinned(moved, KEPT_FRAMES),
             placement=placement,
@@ -163,7 +163,7 @@ def _moved(tracked: TossTrack, shared_from_own: Float[Array, "4 4"]) -> TossTrac
     return replace(tracked, track=track, center_m=center)
 
 
-def _moved_views(looked: Looked, track: ObjectTrack, placement: Placement | None) -> tuple:
+def _moved_views(looked: Looked, placement: Placement | None) -> tuple:
     if placement is None:
         return looked.views
     back = np.linalg.inv(placement.shared_from_own)

@@ -110,7 +110,7 @@ def verdict(
     track: ObjectTrack, seen: Seen, instants: Instants, judged: bool, ambiguous: bool, joined: bool, config: LiveConfig
 ) -> tuple[str, ...]:
     """Everything that is wrong; nothing where the toss is good. `judged`: the table is known, so that rest can be."""
-    said = [_out_of_view(seen), _blur(track, seen, config), _flags(track, seen, config)]
+    said = [_out_of_view(seen), _blur(seen, config), _flags(track, seen, config)]
     if judged and instants.release is None:
         said.append("no free flight was found: it was carried, or is too short")
     elif judged and instants.rest is None:
@@ -136,7 +136,7 @@ def _out_of_view(seen: Seen) -> str:
     return f"the image's edge cuts the object in {cut} frames" if cut > 2 else ""
 
 
-def _blur(track: ObjectTrack, seen: Seen, config: LiveConfig) -> str:
+def _blur(seen: Seen, config: LiveConfig) -> str:
     blurred = int(seen.blurred.sum())
     if blurred <= config.most_blurred * max(seen.frames, 1):
         return ""

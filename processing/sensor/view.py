@@ -164,7 +164,7 @@ def make_view(
     `motion` (4x4, camera frame) moves the object from its place at depth's exposure to that at colour's; None: at rest.
     None is returned where too few points are left.
     """
-    depth_m = _cleaned(crop, config) if motion is None else _moved_depth(crop, rectified, motion, config)
+    depth_m = _cleaned(crop) if motion is None else _moved_depth(crop, rectified, motion, config)
     inside = cv2.erode(crop.mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     h, w = crop.mask.shape
     pixels = np.zeros((h, w, lay.CHANNELS), dtype=np.float32)
@@ -184,7 +184,7 @@ def _ray_steps(corner: tuple[int, int], rectified: Rectification) -> Float[Array
     return np.array([1 / c.fx, 1 / c.fy, (corner[0] - c.cx) / c.fx, (corner[1] - c.cy) / c.fy])
 
 
-def _cleaned(crop: Crop, config: ViewConfig) -> Float32[Array, "h w"]:
+def _cleaned(crop: Crop) -> Float32[Array, "h w"]:
     """Depth inside the mask, without what lies far from the object's bulk."""
     inside = crop.mask & (crop.depth_m > 0)
     if not inside.any():

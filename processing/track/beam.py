@@ -199,7 +199,7 @@ def _put_at_color_time(scene: Scene, h: Hypothesis, i: int, config: BeamConfig) 
         scene.store.fill(i, se3.inverse(carried_on(three, times_s, crop.depth_delay_s, scene.center_m)))
 
 
-def started(store: ViewStore, count: int, view: int, pose: Float[Array, "4 4"]) -> Hypothesis:
+def started(count: int, view: int, pose: Float[Array, "4 4"]) -> Hypothesis:
     """A hypothesis that knows one view's pose."""
     poses = np.full((count, 4, 4), np.nan)
     poses[view] = pose
@@ -214,7 +214,7 @@ def _extended(h: Hypothesis, i: int, c: Candidate, scene: Scene, config: BeamCon
         return replace(h, done=(*h.done, i), total=h.total + config.lost + 0.1)
     poses, costs, on = h.poses.copy(), h.costs.copy(), h.on_surface.copy()
     poses[i], costs[i], on[i] = c.pose, c.fit, c.on_surface
-    keys = extended(h.keyframes, poses, (i,), scene.center_m, config.keyframes)
+    keys = extended(h.keyframes, poses, (i,), config.keyframes)
     return Hypothesis(poses, costs, on, (*h.done, i), keys, h.total + c.cost)
 
 

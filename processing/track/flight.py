@@ -249,7 +249,7 @@ def _followed(scene: Scene, flight: Flight, first: int, beam: BeamConfig) -> Hyp
     n, frames = len(scene.times_s), tuple(int(i) for i in flight.frames)
     poses, costs, on = np.full((n, 4, 4), np.nan), np.full(n, np.nan), np.full(n, np.nan)
     poses[flight.frames], costs[flight.frames], on[flight.frames] = flight.poses, flight.cost, 1.0
-    keys = extended(frames[:1], poses, frames, scene.center_m, beam.keyframes)
+    keys = extended(frames[:1], poses, frames, beam.keyframes)
     h = Hypothesis(poses, costs, on, frames[::-1], keys, 0.0)
     h, _ = follow(scene, np.arange(frames[0] - 1, first - 1, -1), [h], beam)
     ahead = replace(h, done=tuple(range(first, frames[-1] + 1)))

@@ -41,12 +41,11 @@ def extended(
     keyframes: tuple[int, ...],
     poses: Float[Array, "n 4 4"],
     views: Sequence[int],
-    center_m: Float[Array, "3"],
     config: KeyframeConfig,
 ) -> tuple[int, ...]:
     """The keyframes and, one after the other, those of the views that show what none before them shows."""
     for i in views:
-        if i not in keyframes and _is_new(poses, i, keyframes, center_m, config):
+        if i not in keyframes and _is_new(poses, i, keyframes, config):
             keyframes = (*keyframes, i)
     return keyframes
 
@@ -55,7 +54,6 @@ def _is_new(
     poses: Float[Array, "n 4 4"],
     view: int,
     keyframes: tuple[int, ...],
-    center_m: Float[Array, "3"],
     config: KeyframeConfig,
 ) -> bool:
     """Whether `view` shows what no keyframe shows: another side, or the same from much nearer."""

@@ -281,7 +281,7 @@ def _followed(
     stop = first if known.model is not None and known.start is not None else first - 1
     narrow, starts = replace(config.beam, width=2), [all_done]
     if known.model is None and last > first + 1:
-        starts.append(started(scene.store, n, last, best.poses[last]))
+        starts.append(started(n, last, best.poses[last]))
     hypotheses = [follow(scene, np.arange(last - 1, stop, -1), [h], narrow)[0] for h in starts]
     if known.model is None:
         hypotheses = [anchored_to(h, best, first) for h in hypotheses]
@@ -323,13 +323,13 @@ def _starts(scene: Scene, first: int, known: _Known, config: TrackConfig) -> tup
     n = len(scene.times_s)
     if known.model is None:
         pose = first_pose(scene.store, first) if known.start is None else known.start
-        return [started(scene.store, n, first, pose)], config.beam
+        return [started(n, first, pose)], config.beam
     if known.start is not None:
-        return [with_model(started(scene.store, n, first, known.start), known.model)], config.beam
+        return [with_model(started(n, first, known.start), known.model)], config.beam
     found = located(scene, first, known.model, config.beam, config.shape)
     if not found:
         raise BadInput("the given shape fits nothing that the first frame shows; is it a shape of this object?")
-    beam = [replace(with_model(started(scene.store, n, first, c.pose), known.model), total=c.fit) for c in found]
+    beam = [replace(with_model(started(n, first, c.pose), known.model), total=c.fit) for c in found]
     return beam, replace(config.beam, width=max(config.beam.width, config.shape.starts))
 
 
@@ -345,7 +345,7 @@ def _filled_in(
     h = Hypothesis(poses, np.full(n, np.nan), np.full(n, np.nan), tuple(given), (given[0],), 0.0)
     if known.model is not None:
         h = with_model(h, known.model)
-    h = replace(h, keyframes=extended(h.keyframes, h.poses, given, scene.center_m, config.beam.keyframes))
+    h = replace(h, keyframes=extended(h.keyframes, h.poses, given, config.beam.keyframes))
     rejected: dict[int, list[Candidate]] = {}
     for i in range(n):
         if i in given or not scene.store.usable(i):

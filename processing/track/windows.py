@@ -75,7 +75,7 @@ def through_windows(
     for done in range(config.rounds):
         report(0.6 + 0.4 * done / config.rounds)
         poses = _poses(_linked(scene, usable, steps, config), usable, first, best[first], n)
-        keys = extended((first,), poses, usable.tolist(), scene.center_m, keyframes)
+        keys = extended((first,), poses, usable.tolist(), keyframes)
         linked = Hypothesis(poses, np.full(n, np.nan), np.full(n, np.nan), tuple(range(n)), keys, 0.0)
         found.append(refined(scene, linked, first, True, refinement))
         _remember(steps, found[-1].joint.poses, usable, still)

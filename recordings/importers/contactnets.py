@@ -68,7 +68,7 @@ def import_contactnets(
     params = _parameters(source)
     raw = {number: _read(path) for number, path in files.items()}
     units = _units(raw, params, scale_m, dt_s, source)
-    tosses = {number: _states(number, table, files[number], units) for number, table in raw.items()}
+    tosses = {number: _states(table, files[number], units) for number, table in raw.items()}
     checks = check_all(tosses, units.dt_s, warnings)
     twins = duplicates(tosses)
     if twins:
@@ -181,7 +181,7 @@ def _number(params: Mapping[str, Any], key: str) -> float | None:
     return float(value)
 
 
-def _states(number: int, table: Float[Array, "t c"], path: Path, units: _Units) -> States:
+def _states(table: Float[Array, "t c"], path: Path, units: _Units) -> States:
     columns = FORMATS[table.shape[1]]
 
     def part(first: int, count: int) -> Float[Array, "t n"]:

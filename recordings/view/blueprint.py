@@ -29,7 +29,7 @@ FIGURE_NAMES = {"residual": "Residual (0..1)", "on_surface": "On the surface", "
 
 def blueprint(scene: Scene) -> rrb.Blueprint:
     """The table in 3D on the left; images and plots on the right; time over the first toss, four times slowed down."""
-    right = [container for container in (_images(scene), _plots(scene), _words(scene)) if container is not None]
+    right = [container for container in (_images(scene), _plots(scene), _words()) if container is not None]
     return rrb.Blueprint(
         rrb.Horizontal(_spaces(scene), rrb.Vertical(*right, row_shares=[4, 2, 2][: len(right)]), column_shares=[3, 2]),
         _time_panel(scene),
@@ -190,7 +190,7 @@ def _plotted_range(scene: Scene) -> rrb.TimeAxis | None:
     return rrb.TimeAxis(view_range=rr.TimeRange(here(seconds=-usual_s), here(seconds=usual_s)))
 
 
-def _words(scene: Scene) -> rrb.Container:
+def _words() -> rrb.Container:
     events = rrb.TextLogView(origin="/", contents=[f"+ /{EVENTS}", f"+ /{HEALTH}"], name="Events and health")
     return rrb.Tabs(rrb.TextDocumentView(origin=ABOUT, name="What you see"), events, name="Words")
 

@@ -198,7 +198,7 @@ class Thrower:
         if self.scene.holder is not None and self.spec.occluder == "passing":
             found["passer"] = _passing(eye, 0.5 * (instants.release_s + instants.first_impact_s), rng)
         if self.scene.person is not None:
-            found["person"] = _walking(eye, instants.end_s, rng)
+            found["person"] = _walking(eye, rng)
         return found
 
     def _reach(self, rng: np.random.Generator, eye_m: Float[Array, "3"]) -> Transform:
@@ -269,7 +269,7 @@ def _passing(eye_m: Float[Array, "3"], middle_s: float, rng: np.random.Generator
     return place
 
 
-def _walking(eye_m: Float[Array, "3"], end_s: float, rng: np.random.Generator) -> Place:
+def _walking(eye_m: Float[Array, "3"], rng: np.random.Generator) -> Place:
     """Behind the table, from one side to the other."""
     into = _unit(np.array([-eye_m[0], -eye_m[1], 0.0]))
     side = np.cross(into, [0.0, 0.0, 1.0]) * rng.choice([-1, 1])

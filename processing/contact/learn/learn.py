@@ -123,7 +123,7 @@ def learn_contact(
     prepared = prepare([t for t in tracks if t.toss not in again], prior.frame, plane, inertia)
     found = _check_together(tracks, prepared, prior, inertia, fitted)
     steps = transitions(prepared)
-    _require_contact(fitted, steps, prepared)
+    _require_contact(steps, prepared)
     progress.step(1, 6, "data checked")
     sweep, weights = _choose_weights(fitted, steps, prepared, config, progress)
     data = StepData(steps, config.fit.device)
@@ -218,7 +218,7 @@ def _rest_heights(prepared: Prepared, points_m: Float[Array, "v 3"]) -> dict[int
     return found
 
 
-def _require_contact(fitted: Model, steps: Steps, prepared: Prepared) -> None:
+def _require_contact(steps: Steps, prepared: Prepared) -> None:
     """Raises BadInput where flight explains everything."""
     touching = [s for s in prepared.smoothed if not s.phases.in_flight.all()]
     if len(steps) == 0 or not touching:

@@ -56,7 +56,7 @@ def test_a_view_that_shows_nothing_any_more_is_no_part_of_its_flight(scene: Scen
     """The beam makes views again with the motion between the exposures, and one may leave its mask."""
     n, count = len(scene.times_s), scene.store.table[:, lay.COUNT].copy()
     fly = replace(scene, flying=np.isin(np.arange(n), flying(scene, n, FlightConfig())))
-    nothing = started(scene.store, n, 0, first_pose(scene.store, 0))
+    nothing = started(n, 0, first_pose(scene.store, 0))
     scene.store.table[HELD + 4, lay.COUNT] = 0
     try:
         found = flights_followed(fly, 0, nothing, [], TrackConfig().beam, FlightConfig())
@@ -129,7 +129,7 @@ def test_late_depth_is_moved_as_the_body_moves(tiny_world: Any, monkeypatch: Any
     gravity, flies = gravity_in_camera(world.matrix), np.arange(n) >= (0 if falls else n - 1)
     scene = Scene(store, seconds(times_ns), gravity, np.zeros(3), Sift(), flying=flies)
     true, at_depth = (np.array([(world.inverse() @ thrown(t)).matrix for t in when]) for when in (times, after))
-    h = started(store, n, 0, true[0])
+    h = started(n, 0, true[0])
     known = np.where(np.arange(n)[:, None, None] < now, true, np.nan)
     h = replace(h, poses=known, done=tuple(range(now)), keyframes=tuple(range(now)))
     for i in range(now):
@@ -158,7 +158,7 @@ def test_a_spin_of_34_degrees_a_frame_is_found_among_all(scene: Scene, tiny_worl
 def test_the_beam_goes_on_from_a_solved_flight_both_ways(scene: Scene, tiny_world: Any) -> None:
     n, camera = len(scene.times_s), tiny_world.world_from_camera.rotation
     fly = replace(scene, flying=np.isin(np.arange(n), flying(scene, n, FlightConfig())))
-    nothing = started(scene.store, n, 0, first_pose(scene.store, 0))
+    nothing = started(n, 0, first_pose(scene.store, 0))
     best = flights_followed(fly, 0, nothing, [], TrackConfig().beam, FlightConfig())[0]
     assert best.tracked == tuple(range(n))
     assert flights_followed(fly, 0, best, [best], TrackConfig().beam, FlightConfig()) == []  # all agree already

@@ -53,7 +53,7 @@ def scene(tiny_world: Any) -> Scene:
 def sliding(scene: Scene, spin: Array) -> TrajectoryHypothesis:
     """A trajectory that follows the cloud and turns steadily (rad/s, camera axes), whatever the images show: it is not
     refined, only judged."""
-    h = started(scene.store, FRAMES, 0, first_pose(scene.store, 0))
+    h = started(FRAMES, 0, first_pose(scene.store, 0))
     poses = np.tile(h.poses[0], (FRAMES, 1, 1))
     for i, pose in enumerate(poses):
         pose[:3, :3] = rotation_exp(spin * i * STEP_S) @ pose[:3, :3]
@@ -63,7 +63,7 @@ def sliding(scene: Scene, spin: Array) -> TrajectoryHypothesis:
 
 def judged(scene: Scene, poses: Array) -> TrajectoryHypothesis:
     """A hypothesis at these poses, not refined."""
-    estimated = replace(started(scene.store, FRAMES, 0, poses[0]), poses=poses, done=tuple(range(FRAMES)))
+    estimated = replace(started(FRAMES, 0, poses[0]), poses=poses, done=tuple(range(FRAMES)))
     graph = replace(TrackConfig().hypotheses.graph, schedule=((0, 1, 0.004, 0.1, 0.004, 0.5),))
     found = refined(scene, estimated, 0, True, replace(TrackConfig().hypotheses, graph=graph))
     return replace(found, joint=replace(found.joint, poses=poses))
