@@ -28,7 +28,6 @@ PROFILE = "processing.track.revolution.profile_kernels"
 AZIMUTH = "processing.track.revolution.azimuth_kernels"
 F8, F4, I8 = "float64", "float32", "int64"
 V, M, T, Q = f"{F8}[::1]", f"{F8}[:,::1]", f"{F8}[:,:,::1]", f"{F8}[:,:,:,::1]"
-T2 = "uint16[:,:,::1]"
 V4, M4, T4, Q4 = f"{F4}[::1]", f"{F4}[:,::1]", f"{F4}[:,:,::1]", f"{F4}[:,:,:,::1]"
 VI, MI, VB, MB = f"{I8}[::1]", f"{I8}[:,::1]", "boolean[::1]", "boolean[:,::1]"
 MOTION = (V, V, VB, V, V, V, F8, V)
@@ -58,9 +57,9 @@ KERNELS: dict[tuple[str, str], list[tuple[str, ...]]] = {
     (STEPS, "roll_rows"): [ROLL],
     (SOLVER, "solve_rows"): [(T, M, F8, M, F8, I8, F8, I8)],
     ("processing.field.fuse", "_integrate"): [
-        (T4, T4, T4, T4, T2, T2, Q4, I8, V4, F4, F4, M4, M4, M4, T4, MB, MB, "uint8[:,:,:]", MB)
+        (*[T4] * 6, Q4, I8, V4, F4, F4, M4, M4, M4, T4, MB, MB, "uint8[:,:,:]", MB, F4)
     ],
-    ("processing.field.outline", "_add_gaps"): [(T4, V, M, F4, T4, T4)],
+    ("processing.field.outline", "_add_gaps"): [(T4, V, M, F4, F4, T4, T4)],
     ("processing.sensor.surface_kernel", "fit_surface"): [(M4, MB, V, I8, F8, M4, T4)],
     ("recordings.alignment.kernels", "project"): [(M4, T, V, V, T, M)],
     ("recordings.alignment.kernels", "draw"): [(M4, T, M, M4, V)],

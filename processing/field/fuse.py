@@ -31,6 +31,8 @@ another face (weighed fully they bulge it out; weighed down from the surface on,
 SEEN_BEHIND = 0.04
 """A cell that depth calls inside is unseen all the same where fewer than this share of the views say so: near an edge
 it only lies behind another face, and its own was in view of none."""
+LEAST_SEEN = 0.5
+"""Fewer sure views have not seen a cell: what only views show whose poses are guesses is one."""
 OFF_MASK = 0.2
 """An unseen cell is empty where more than this share of the views sees it beside the mask."""
 
@@ -84,7 +86,7 @@ def fuse(views: Sequence[FieldView], config: FuseConfig, prior_shape: ObjectShap
     weight = np.zeros(shape, dtype=np.float32)
     passed = np.zeros(shape, dtype=np.float32)
     blocked = np.zeros(shape, dtype=np.float32)
-    masked, unmasked = np.zeros(shape, dtype=np.uint16), np.zeros(shape, dtype=np.uint16)
+    masked, unmasked = np.zeros(shape, dtype=np.float32), np.zeros(shape, dtype=np.float32)
     paint = np.zeros((*shape, 4), dtype=np.float32)
 
     def integrate(part: slice) -> None:
@@ -103,11 +105,13 @@ def fuse(views: Sequence[FieldView], config: FuseConfig, prior_shape: ObjectShap
                 view.unmasked,
                 view.color_rgb,
                 view.inside if view.colorless is None else view.inside & ~view.colorless,
+                np.float32(view.weight),
             )
 
     in_parts(integrate, shape[0], PART)
-    weight[(total < 0) & (blocked < SEEN_BEHIND * len(views))] = 0
-    off_masks = unmasked > np.maximum(2.0, OFF_MASK * (masked + unmasked.astype(np.float32)))
+    weight[(total < 0) & (blocked < SEEN_BEHIND * sum(view.weight for view in views))] = 0
+    weight[blocked + passed < LEAST_SEEN] = 0
+    off_masks = unmasked > np.maximum(2.0, OFF_MASK * (masked + unmasked))
     free = (passed > np.maximum(2.0, 0.2 * blocked)) | (off_masks & (weight == 0))
     sdf_m = np.where(weight > 0, total / np.maximum(weight, 1e-9), 0).astype(np.float32)
     rgb = paint[..., :3] / np.maximum(paint[..., 3:], 1e-9)
@@ -137,10 +141,10 @@ def _nearest_color(rgb: Float32[Array, "a b c 3"], known: Bool[Array, "a b c"]) 
 @no_type_check  # numba cannot cache what the tests' type checker wraps
 def _integrate(
     total, weight, passed, blocked, masked, unmasked, paint, first, low, voxel, truncation, pose, K, depth, plane,
-    outside, off_mask, rgb, colored,
+    outside, off_mask, rgb, colored, share,
 ):  # fmt: skip
-    """One view into the sums, which begin at layer `first` of the grid. Cells are walked along the last axis; all
-    lengths in metres."""
+    """One view, by its `share`, into the sums, which begin at layer `first` of the grid. Cells are walked along the
+    last axis; all lengths in metres."""
     height, width = depth.shape
     n0, n1, n2 = total.shape
     step0, step1, step2 = pose[0, 2] * voxel, pose[1, 2] * voxel, pose[2, 2] * voxel
@@ -158,9 +162,9 @@ def _integrate(
                     if 0 <= u < width and 0 <= v < height:
                         d = depth[v, u]
                         if off_mask[v, u]:
-                            unmasked[i, j, k] += 1
+                            unmasked[i, j, k] += share
                         else:
-                            masked[i, j, k] += 1
+                            masked[i, j, k] += share
                         if d > 0:
                             p0, p1, p2 = plane[v, u, 0], plane[v, u, 1], plane[v, u, 2]
                             length = np.sqrt(p0 * p0 + p1 * p1 + p2 * p2)
@@ -169,13 +173,13 @@ def _integrate(
                             if distance > -truncation and gap > -3 * truncation:
                                 ray = np.sqrt(x * x + y * y + z * z)
                                 facing = d / (length * d * ray)
-                                w = facing / (d * d * d * d)
+                                w = share * facing / (d * d * d * d)
                                 if distance > truncation:
-                                    passed[i, j, k] += 1
+                                    passed[i, j, k] += share
                                     distance = truncation
                                     w *= np.float32(0.3)
                                 else:
-                                    blocked[i, j, k] += 1
+                                    blocked[i, j, k] += share
                                     if distance < -BEHIND_FULL * truncation:
                                         w *= (np.float32(1.0) + distance / truncation) / (np.float32(1.0) - BEHIND_FULL)
                                 if colored[v, u] and abs(distance) < np.float32(0.6) * truncation:
@@ -185,7 +189,7 @@ def _integrate(
                                 total[i, j, k] += w * distance
                                 weight[i, j, k] += w
                         elif outside[v, u]:
-                            passed[i, j, k] += 1
+                            passed[i, j, k] += share
                 x += step0
                 y += step1
                 z += step2

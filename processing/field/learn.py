@@ -3,26 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
-from jaxtyping import Bool, Int64
+from jaxtyping import Bool, Float, Int64
 from numpy import ndarray as Array
 
 from processing.engine.parts import side_by_side
+from processing.field.fuse import LEAST_SEEN
 from processing.field.mesh import extract_mesh
 from processing.field.train import FieldConfig, train_field
-from processing.field.views import FieldView, make_view, without_strays
+from processing.field.views import FieldView, make_view, object_points, without_strays
 from processing.motion.interpolate import pose_at
 from recordings.errors import BadInput
-from recordings.geometry import CameraModel
+from recordings.geometry import CameraModel, skew
 from recordings.progress import Progress
 from recordings.records import RgbdFrame
 from recordings.results.folder import RobotMasks
-from recordings.tracks import ObjectShape, ObjectTrack, Status
+from recordings.tracks import ObjectShape, ObjectTrack
 
-SURE: tuple[Status, ...] = ("tracked",)
-POSED: tuple[Status, ...] = ("tracked", "interpolated")
+SURE_M = 0.004
+"""A view whose pose may be off by so much on the body (root mean square) counts half, one that is surer more."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +59,7 @@ def learn_shape(
 
     Raises BadInput where no tracked frame shows the object; where none is tracked, none with a pose.
     """
-    views = chosen_views(tosses, camera, config, SURE if any_sure(tosses) else POSED)
+    views = chosen_views(tosses, camera, config, alike=not any_sure(tosses))
     trained = train_field(views, config.field, device, progress, prior_shape)
     frame = tosses[0].track.object_frame
     return extract_mesh(trained.field, trained.grid, frame, "neural field"), len(views)
@@ -70,22 +71,41 @@ def any_sure(tosses: Sequence[TossViews]) -> bool:
 
 
 def chosen_views(
-    tosses: Sequence[TossViews], camera: CameraModel, config: LearnConfig, statuses: tuple[Status, ...] = SURE
+    tosses: Sequence[TossViews], camera: CameraModel, config: LearnConfig, alike: bool = False
 ) -> list[FieldView]:
-    """Views of frames of these statuses, spread evenly over all tosses, without what is none of the object's. Raises
-    BadInput where none shows the object."""
-    places = [(t, i) for t in tosses for i in range(len(t.track.status)) if t.track.status[i] in statuses]
+    """Views of frames that have a pose, spread evenly over all tosses, without what is none of the object's; each
+    counts by how sure its pose is, unless all count `alike`. Raises BadInput where none (that is sure) shows the
+    object."""
+    places = [(t, i) for t in tosses for i in np.flatnonzero(~t.track.lost)]
     chosen = (
         [places[i] for i in np.unique(np.linspace(0, len(places) - 1, config.most_views).astype(int))] if places else []
     )
-    found = side_by_side(lambda place: _view(place[0], place[1], camera), chosen)
-    views = [view for view in found if view is not None]
-    if not views:
+    cut = side_by_side(lambda place: _view(place[0], int(place[1]), camera), chosen)
+    found = [(place, view) for place, view in zip(chosen, cut, strict=True) if view is not None]
+    views = without_strays([view for _, view in found])
+    if views and not alike:
+        points_m = np.concatenate([object_points(view) for view in views])
+        sigmas_m = [surface_sigma_m(t.track, int(i), points_m) for (t, i), _ in found]
+        views = [replace(v, weight=SURE_M**2 / (SURE_M**2 + s**2)) for v, s in zip(views, sigmas_m)]
+    if sum(view.weight for view in views) < LEAST_SEEN:
         raise BadInput(
             "no frame has a pose that is sure, so there is nothing to learn a shape from; wanted at least one: look at "
             "the masks with `toss-view`, give a first mask, or record closer and with more light"
         )
-    return without_strays(views)
+    return views
+
+
+def surface_sigma_m(track: ObjectTrack, position: int, points_m: Float[Array, "n 3"]) -> float:
+    """Root mean square, metres, by which points of the body (object frame) are off where a frame's pose puts them, as
+    its covariance says; 0 where that is not known, which is no doubt."""
+    pose, covariance = track.camera_from_object[position], track.covariance[position]
+    if not np.isfinite(covariance).all() or len(points_m) == 0:
+        return 0.0
+    middle, second = pose[:3, :3] @ points_m.mean(axis=0), pose[:3, :3] @ (points_m.T @ points_m) @ pose[:3, :3].T
+    second = second / len(points_m)
+    turn, shift, both = covariance[:3, :3], covariance[3:, 3:], covariance[:3, 3:]
+    turned = np.sum(turn * (np.trace(second) * np.eye(3) - second)) - 2 * np.trace(skew(middle) @ both)
+    return float(np.sqrt(max(turned + np.trace(shift), 0.0)))
 
 
 def _view(toss: TossViews, position: int, camera: CameraModel) -> FieldView | None:

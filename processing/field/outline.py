@@ -41,7 +41,7 @@ def moved_out(
         directions = _outline_rays(view)
         pose = view.camera_from_object_at_depth
         eye = (-pose[:3, :3].T @ pose[:3, 3] - origin_m) / voxel_m
-        _add_gaps(sdf_m, eye, directions @ pose[:3, :3], np.float32(reach_m), gap_sum, count)
+        _add_gaps(sdf_m, eye, directions @ pose[:3, :3], np.float32(reach_m), np.float32(view.weight), gap_sum, count)
     width = WIDTH * reach_m / voxel_m
     peak = (2 * np.pi) ** -1.5 * width**-3
     gap_sum, count = (ndimage.gaussian_filter(a, width, mode="constant") for a in (gap_sum, count))
@@ -62,7 +62,7 @@ def _outline_rays(view: FieldView) -> Float[Array, "n 3"]:
 
 @numba.njit(cache=True, nogil=True)
 @no_type_check  # numba cannot cache what the tests' type checker wraps
-def _add_gaps(sdf, eye, directions, reach, gap_sum, count):
+def _add_gaps(sdf, eye, directions, reach, share, gap_sum, count):
     """Adds the least distance along each ray, where it is less than `reach`, to the cell where it is. eye, directions:
     in cells."""
     last = np.array([sdf.shape[0] - 1.001, sdf.shape[1] - 1.001, sdf.shape[2] - 1.001])
@@ -87,8 +87,8 @@ def _add_gaps(sdf, eye, directions, reach, gap_sum, count):
             i = int(min(max(eye[0] + at * d[0], 0.0), last[0]) + 0.5)
             j = int(min(max(eye[1] + at * d[1], 0.0), last[1]) + 0.5)
             k = int(min(max(eye[2] + at * d[2], 0.0), last[2]) + 0.5)
-            gap_sum[i, j, k] += least
-            count[i, j, k] += 1.0
+            gap_sum[i, j, k] += share * least
+            count[i, j, k] += share
 
 
 @numba.njit(cache=True, nogil=True, inline="always")

@@ -34,17 +34,18 @@ class RayDataset:
 
 
 def make_ray_dataset(views: Sequence[FieldView]) -> RayDataset:
-    """All object rays with depth, and all rays that surely pass the object."""
+    """The views' object rays with depth, and their rays that surely pass the object: of each view as large a share of
+    them, evenly, as it counts."""
     parts: dict[str, list[np.ndarray]] = {name: [] for name in RayDataset.__dataclass_fields__}
     for number, view in enumerate(views):
-        v, u = np.nonzero(view.depth_m)
+        v, u = _share(view, view.depth_m)
         parts["direction"].append(_directions(view, u, v))
         parts["depth"].append(view.depth_m[v, u])
         parts["plane"].append(view.plane[v, u])
         parts["rgb"].append(view.color_rgb[v, u].astype(np.float32) / 255)
         parts["view"].append(np.full(len(u), number))
         parts["colored"].append(np.ones(len(u)) if view.colorless is None else ~view.colorless[v, u])
-        v, u = np.nonzero(view.outside)
+        v, u = _share(view, view.outside)
         parts["passing_direction"].append(_directions(view, u, v))
         parts["passing_view"].append(np.full(len(u), number))
     joined = {name: np.concatenate(values) for name, values in parts.items()}
@@ -54,6 +55,13 @@ def make_ray_dataset(views: Sequence[FieldView]) -> RayDataset:
             for name, values in joined.items()
         }
     )
+
+
+def _share(view: FieldView, where: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rows and columns of the pixels of an image that are not 0, or of as many of them as the view counts."""
+    v, u = np.nonzero(where)
+    kept = np.linspace(0, len(u) - 1, round(view.weight * len(u))).astype(int)
+    return v[kept], u[kept]
 
 
 def _directions(view: FieldView, u: np.ndarray, v: np.ndarray) -> np.ndarray:

@@ -32,7 +32,8 @@ class FieldView:
     `unmasked` all that are not the mask's; neither where something may hide it.
     `camera_from_object` is the pose at the colour exposure, `camera_from_object_at_depth` at the depth exposure, to
     which colours and masks are moved: as a plane at the object's median depth moves.
-    `colorless` marks pixels whose colour is not the object's (None: there are none).
+    `colorless` marks pixels whose colour is not the object's (None: there are none). `weight` is how much the view
+    counts against one whose pose is sure (1).
     """
 
     K: Float[Array, "3 3"]
@@ -45,6 +46,7 @@ class FieldView:
     camera_from_object: Float[Array, "4 4"]
     camera_from_object_at_depth: Float[Array, "4 4"]
     colorless: Bool[Array, "h w"] | None = None
+    weight: float = 1.0
 
     def posed(self, at_color: Float[Array, "4 4"], at_depth: Float[Array, "4 4"]) -> FieldView:
         return replace(self, camera_from_object=at_color, camera_from_object_at_depth=at_depth)

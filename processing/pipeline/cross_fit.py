@@ -35,6 +35,8 @@ ALIKE = 0.1
 lying (choose-000) .04 of chromaticity, .14 of depth with outline; more frames do not average that out."""
 SURE_NATS = 0.5 * float(ndtri(0.95)) ** 2
 """What chance makes of a Gaussian once in twenty times (one side)."""
+SPOILED_NATS = SURE_NATS + float(np.log(7.0))
+"""What must speak against the adjustment of a toss: of sixteen (generated sessions) it made two worse by a degree."""
 FAR_BETTER = 0.5 * float(np.log(2.0) / ALIKE) ** 2
 """Nats of half the residuals: a toss that lies right on a shape fits hardly worse than it does alone."""
 FOLDS = 3
@@ -96,8 +98,8 @@ def unbent(run: Run, toss: int, together: Done, alone: Done, images: Images) -> 
 
 
 def with_free_surface(run: Run, tracks: Mapping[int, Done], images: Mapping[int, Images]) -> dict[int, Done]:
-    """The tracks after one adjustment of all of them with the surface that they show free; those of tosses that surely
-    fitted themselves better before, as they were."""
+    """The tracks after one adjustment of all of them with the surface that they show free; those of tosses that it
+    surely spoiled, as they were."""
     shape = fused(run, tracks, images, draft=True)
     if shape is None:
         return dict(tracks)
@@ -105,7 +107,7 @@ def with_free_surface(run: Run, tracks: Mapping[int, Done], images: Mapping[int,
 
     def stays(toss: int) -> bool:
         was, now = (TrackResiduals(on_itself(run, done, images[toss]), None) for done in (tracks[toss], after))
-        return was.surely_better(now)
+        return was.surely_better(now, SPOILED_NATS)
 
     kept = each(run, tracks, stays)
     return {t: done if kept[t] else after for t, done in tracks.items()}

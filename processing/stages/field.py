@@ -13,7 +13,7 @@ from processing.sensor.noise import DepthNoise
 from processing.store import Done, plain
 from recordings.results.folder import read_shape, read_track, write_shape
 
-VERSION = 13
+VERSION = 14
 
 
 @dataclass(frozen=True)

@@ -7,14 +7,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from processing.field.fuse import fuse
-from processing.field.learn import POSED, SURE, chosen_views
+from processing.field.learn import chosen_views
 from processing.field.mesh import grid_mesh
 from processing.images import Images, track_and_image_keys
 from processing.run import Run
 from processing.store import Done, plain
 from recordings.results.folder import read_track, write_shape
 
-VERSION = 9
+VERSION = 10
 DRAFT = 2.0
 """Of a draft the cells are so many times as wide: far narrower than the band around a surface all the same."""
 
@@ -38,7 +38,7 @@ def fuse_frames(
 
     def compute(folder: Path) -> FuseResult:
         seen = [images[t].open().views(read_track(done.folder, t)) for t, done in tracks.items()]
-        views = chosen_views(seen, run.camera, run.config.shape, POSED if draft else SURE)
+        views = chosen_views(seen, run.camera, run.config.shape, alike=draft)
         write_shape(folder, grid_mesh(fuse(views, config), seen[0].track.object_frame))
         return FuseResult(tuple(tracks), len(views))
 

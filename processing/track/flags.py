@@ -15,7 +15,7 @@ from processing.sensor import noise
 from processing.sensor import view_layout as lay
 from processing.sensor.view_store import ViewStore
 from processing.track.beam import Scene
-from recordings.geometry import rotation_angle_rad, rotation_log, skew
+from recordings.geometry import rotation_log, skew
 from recordings.tracks import ObjectTrack, Status
 
 
@@ -48,12 +48,7 @@ class FlagConfig:
     outside_share: float = 0.1
     """Views of which more lies outside the other's outline contradict each other ..."""
     contradicting: int = 3
-    """... as poses, where so many in a row do: a mask may be wrong for a frame or two. As few unsure ones in a row are
-    unsure by themselves."""
-    confirmed_sigmas: float = 3.0
-    """A run of unsure frames that a second solution turned by more of its standard deviations (median) is contradicted
-    by it. Runs of `choose` sessions: three turned by 3.1 to 5.8 (two were wrong), ten by .8 to 2.7 (four were right,
-    one by half, four are of round bodies' turns about their axes, which all their frames have wrong)."""
+    """... as poses, where so many in a row do: a mask may be wrong for a frame or two."""
     unsure_deg: float = 15.0
     """A pose whose rotation may be off by more than this (standard deviation) is a guess, marked as interpolated: a
     flip (45 degrees) lies within three of them."""
@@ -195,22 +190,13 @@ def reflagged(
     config: FlagConfig,
 ) -> ObjectTrack:  # fmt: skip
     """The track at poses that were solved for anew, with their covariances (twist of the object frame) and what each
-    view costs there. Frames that took no part (NaN) or fit nothing are as unsure as they were. So are one or two unsure
-    ones among others, whose doubt is their own (an impact), and a longer run unless it was confirmed: how that lies to
-    the sure ones all see, but where the two solutions contradict each other one of them is wrong."""
+    view costs there. Frames that took no part (NaN) or fit nothing are as unsure as they were, and so are unsure ones:
+    one solution about which all are sure knows nothing of the others that left them open."""
     status, covariance = list(track.status), track.covariance.copy()
-    claimed = np.array([camera_covariance(*each) for each in zip(poses, config.correlated * twists, strict=True)])
     sure = np.array([s == "tracked" for s in status])
-    moved_rad = [rotation_angle_rad(a.T @ b) for a, b in zip(track.camera_from_object[:, :3, :3], poses[:, :3, :3])]
-    sigmas = np.array(moved_rad) / np.sqrt(np.trace(claimed[:, :3, :3], axis1=1, axis2=2))
-    least = config.contradicting if sure.any() else len(sure) + 1
-    for known, run in groupby(range(len(sure)), lambda i: sure[i]):
-        frames = list(run)
-        judged = sigmas[frames][np.isfinite(sigmas[frames])]
-        confirmed = len(frames) >= least and len(judged) > 0 and np.median(judged) <= config.confirmed_sigmas
-        for i in frames if known or confirmed else ():
-            if cost[i] <= config.tracked_cost:
-                covariance[i], status[i] = claimed[i], _status(claimed[i], config)
+    for i in np.flatnonzero(sure & (cost <= config.tracked_cost)):
+        covariance[i] = camera_covariance(poses[i], config.correlated * twists[i])
+        status[i] = _status(covariance[i], config)
     return replace(track, camera_from_object=poses, covariance=covariance, status=tuple(status))
 
 

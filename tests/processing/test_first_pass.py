@@ -45,9 +45,8 @@ def stages(
             turn[:3, :3] = rotation_exp(np.array([0.0, np.pi / 2, 0.0]))
         n = len(times_ns)
         status: Any = ("interpolated" if toss in unsure else "tracked",) * n
-        track = ObjectTrack(
-            toss, "d455", "object", times_ns, np.stack(poses) @ turn, status, np.tile(1e-6 * np.eye(6), (n, 1, 1))
-        )
+        covariance = np.tile((9.0 if toss in unsure else 1e-6) * np.eye(6), (n, 1, 1))
+        track = ObjectTrack(toss, "d455", "object", times_ns, np.stack(poses) @ turn, status, covariance)
         write_track(tracks, track)
         own = folder / f"segment-{toss}"
         own.mkdir()

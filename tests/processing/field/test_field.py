@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from processing.field.fuse import FuseConfig, fuse
 from processing.field.mesh import extract_mesh, grid_mesh, surface_of
+from processing.field.rays import make_ray_dataset
 from processing.field.train import FieldConfig, train_field
 from processing.field.views import FieldView, make_view, object_points, without_strays
 from processing.motion.interpolate import pose_at
@@ -142,6 +143,43 @@ def test_refinement_pulls_disturbed_poses_back(views):
     disturbed = moved_about(views, 0.8, 0.001)
     trained = train_field(disturbed, FieldConfig(steps=0))
     assert spread_deg(trained.views, views) < 0.4 * spread_deg(disturbed, views)
+
+
+def test_views_whose_poses_are_guesses_leave_the_surface_to_the_others(views):
+    wrong = moved_about(views, by_deg=30.0, by_m=0.01)
+    mixed = [view if i % 3 else other for i, (view, other) in enumerate(zip(views, wrong))]
+    weighed = [view if i % 3 else replace(view, weight=1e-3) for i, view in enumerate(mixed)]
+    errors_m = [
+        np.quantile(np.abs(distance_to_cube_m(grid_mesh(fuse(v, FuseConfig(voxel_m=0.002))).vertices_m)), 0.95)
+        for v in (weighed, mixed)
+    ]
+    assert errors_m[0] < 0.0015 < 0.004 < errors_m[1]
+
+
+def test_two_views_that_count_half_count_as_one(views):
+    twice, config = [*views[:8], *views[:8]], FuseConfig(voxel_m=0.003)
+    halves = fuse([replace(v, weight=0.5) for v in twice], config)
+    once = fuse([replace(v, weight=1.0 if i < 8 else 0.0) for i, v in enumerate(twice)], config)
+    np.testing.assert_allclose(halves.sdf_m, once.sdf_m, atol=1e-6)
+    np.testing.assert_allclose(halves.weight, once.weight, rtol=1e-5)
+    np.testing.assert_array_equal(halves.free, once.free)
+
+
+def test_what_only_a_guess_has_seen_is_unseen(views):
+    config = FuseConfig(voxel_m=0.003)
+    alone = fuse(
+        [replace(views[0], weight=0.4), *(replace(v, depth_m=0 * v.depth_m, weight=0.0) for v in views[1:])], config
+    )
+    assert fuse(views[:1], config).weight.any()
+    assert not alone.weight.any()
+
+
+def test_of_a_view_that_counts_a_quarter_a_quarter_of_the_rays_is_learned_from(views):
+    whole, part = (make_ray_dataset([replace(views[0], weight=w), views[1]]) for w in (1.0, 0.25))
+    for name in ("view", "passing_view"):
+        of_both = [np.bincount(getattr(rays, name).numpy(), minlength=2) for rays in (whole, part)]
+        assert of_both[1][0] == round(0.25 * of_both[0][0])
+        assert of_both[1][1] == of_both[0][1]
 
 
 def spread_deg(estimated, true) -> float:

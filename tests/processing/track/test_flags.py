@@ -136,31 +136,3 @@ def test_poses_that_were_solved_for_anew_are_as_sure_as_their_new_covariances() 
     np.testing.assert_array_equal(found.camera_from_object, after)
     np.testing.assert_allclose(found.covariance[0], camera_covariance(after[0], config.correlated * twists[0]))
     np.testing.assert_array_equal(found.covariance[2:], covariance[2:])
-
-
-def test_a_run_of_unsure_frames_is_as_sure_as_all_tosses_make_it_and_one_among_others_as_it_was() -> None:
-    config, n = FlagConfig(), 8
-    status = ("tracked", "interpolated", "tracked", *["interpolated"] * 3, "tracked", "tracked")
-    covariance = np.tile(0.3**2 * np.eye(6), (n, 1, 1))
-    before = ObjectTrack(
-        0, "d455", "object", np.arange(n, dtype=np.int64), np.tile(np.eye(4), (n, 1, 1)), status, covariance
-    )
-    twists = np.tile(1e-4 * np.eye(6), (n, 1, 1))
-    found = reflagged(before, before.camera_from_object, twists, np.full(n, 0.1), config)
-    assert found.status == ("tracked", "interpolated", *["tracked"] * 6)
-    np.testing.assert_array_equal(found.covariance[1], covariance[1])
-
-
-@pytest.mark.parametrize(("sigmas", "run"), [(2.5, "tracked"), (3.5, "interpolated")])
-def test_a_run_of_unsure_frames_that_a_second_solution_contradicts_stays_unsure(sigmas: float, run: str) -> None:
-    config, n, sigma_rad = FlagConfig(), 8, 0.02
-    status = ("tracked", "tracked", *["interpolated"] * 4, "tracked", "tracked")
-    before = ObjectTrack(
-        0, "d455", "object", np.arange(n, dtype=np.int64), np.tile(np.eye(4), (n, 1, 1)), status,
-        np.tile(0.3**2 * np.eye(6), (n, 1, 1)),
-    )  # fmt: skip
-    twists = np.tile(sigma_rad**2 / 3 / config.correlated * np.eye(6), (n, 1, 1))
-    after = before.camera_from_object.copy()
-    after[:, :3, :3] = rotation_exp(np.array([0.0, sigmas * sigma_rad, 0.0]))
-    found = reflagged(before, after, twists, np.full(n, 0.1), config)
-    assert found.status == ("tracked", "tracked", *[run] * 4, "tracked", "tracked")
