@@ -52,7 +52,7 @@ def process(run: Run, variant: Variant, scope: Scope, model: Path | None = None)
         last = one_by_one(run, alone, images, scope)
     else:
         last = together(run, variant, scope, alone, images)
-    return write_record(run, variant, scope, last, alone, scene, rig, masks)
+    return write_record(run, variant, scope, last, alone, scene, rig, masks, images)
 
 
 def with_model(run: Run, images: Mapping[int, Images], model: Path) -> Pass:

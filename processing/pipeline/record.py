@@ -6,11 +6,13 @@ import os
 from collections import Counter
 from collections.abc import Mapping
 
+from processing.images import Images
 from processing.pipeline import notices as say
 from processing.pipeline.passes import Pass
-from processing.run import Run
+from processing.run import Run, each
 from processing.segment.background.depth_scale import posterior_sigma
 from processing.stages.carry import CarryResult
+from processing.stages.judge import judge
 from processing.stages.lose import lose
 from processing.stages.masks.segment import SegmentResult
 from processing.stages.recording.every_frame import masks_in_every_frame, poses_in_every_frame
@@ -25,7 +27,7 @@ from recordings.results.folder import Scope, TossRecord, VariantRecord, read_tra
 
 def write_record(
     run: Run, variant: Variant, scope: Scope, last: Pass, alone: Mapping[int, Done], scene: Done[SceneResult],
-    rig: Done[RigResult], masks: Mapping[int, Done[SegmentResult]],
+    rig: Done[RigResult], masks: Mapping[int, Done[SegmentResult]], images: Mapping[int, Images],
 ) -> VariantRecord:  # fmt: skip
     """variants/<name>.<scope>.json. `alone`: each toss's first pass, where there is one. A lost toss has no pose; its
     shape is said to be that of the first toss."""
@@ -35,10 +37,11 @@ def write_record(
     moved = posed_together(last.tracks, alone)
     on_shape = {t: alone[t] for t in moved if not isinstance(last.tracks[t].result, (RegisterResult, CarryResult))}
     held = on_shape.keys() & sharing(last.tracks)
+    fits = each(run, on_shape, lambda t: judge(run, f"toss {t}", {t: tracks[t]}, {t: shapes[t]}, images, True))
 
     def of_toss(t: int) -> TossRecord:
-        before = on_shape.get(t)
-        poses = poses_in_every_frame(run, t, tracks[t], (first, tracks[first]), scale_sigma, before, t in held)
+        of_shape = on_shape.get(t), t in held, fits.get(t)
+        poses = poses_in_every_frame(run, t, tracks[t], (first, tracks[first]), scale_sigma, *of_shape)
         return TossRecord(t, poses.name, shapes[t].name, masks_in_every_frame(run, t, masks[t]).name)
 
     tosses = tuple(of_toss(t) for t in run.recorded)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
@@ -18,6 +19,7 @@ from processing.sensor.noise import DARK
 from processing.sensor.render import RaycastRenderer
 from recordings.geometry import CameraModel
 from recordings.records import RgbdFrame
+from recordings.results.stage_files import stage_arrays
 from recordings.tracks import ObjectShape, ObjectTrack
 
 HIDDEN_M = 0.015
@@ -121,6 +123,15 @@ def difference(
     r = min(max(alike, 0.0), 0.95)
     worth = n * (1 - r) / (1 + r)
     return Difference(float(gaps.mean()), float(gaps.std(ddof=1) / np.sqrt(worth)), n, worth)
+
+
+ROWS = "residuals.npz"
+
+
+def read_rows(folder: Path) -> Float[Array, "n 6"]:
+    """Residuals by frame (`Explained.rows`) as the stage `judge` keeps them in its folder."""
+    with stage_arrays(folder / ROWS) as stored:
+        return np.asarray(stored["rows"])
 
 
 def explain(

@@ -21,6 +21,7 @@ from processing.track.flags import (
     camera_covariance,
     published,
     with_drift,
+    with_misfit,
     with_shape_error,
 )
 from recordings.geometry import rotation_exp
@@ -154,6 +155,22 @@ def test_a_toss_that_others_hold_is_no_surer_than_its_shape_and_no_less_sure_by_
         turn, np.radians(np.where(np.flatnonzero(known) % 2, 0.4, 1.0) * HELD_SHAPE_DEG)[:, None] * np.ones(3)
     )
     np.testing.assert_allclose(by_itself, alone.covariance[known])
+
+
+def test_a_frame_that_the_shape_explains_worse_than_chance_makes_is_as_much_less_sure() -> None:
+    track = true_track()
+    posed = np.flatnonzero(~track.lost)
+    rng = np.random.default_rng(1)
+    rows = np.zeros((len(posed), 6))
+    rows[:, 1] = posed
+    rows[:, 2:4] = (0.001, 0.08) * np.exp(0.05 * rng.normal(size=(len(posed), 2)))
+    rows[2, 3], rows[4, 2] = 0.08 * 1.6, 0.001 * 2.0  # an outline, and depth
+    before, after = (np.trace(t.covariance[posed], axis1=1, axis2=2) for t in (track, with_misfit(track, rows)))
+    times = np.sqrt(after / before)
+    expected = np.ones(len(posed))
+    expected[[2, 4]] = 1.6, 2.0
+    np.testing.assert_allclose(times, expected, rtol=0.04)
+    assert with_misfit(track, rows[:0]) is track
 
 
 def test_in_coarse_depth_poses_are_as_much_less_sure_as_means_over_it_and_in_fine_depth_no_surer() -> None:

@@ -13,15 +13,16 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray as Array
 
+from processing.refine.image_residuals import read_rows
 from processing.run import Run
 from processing.sensor.still import Kept, whole_session
 from processing.store import Done
-from processing.track.flags import published, with_drift, with_shape_error
+from processing.track.flags import published, with_drift, with_misfit, with_shape_error
 from recordings.results.folder import RobotMasks, read_masks, read_track, write_masks, write_track
 from recordings.results.track_notes import FIT, NOTES
 from recordings.tracks import ObjectTrack
 
-VERSION = 10
+VERSION = 11
 
 
 @dataclass(frozen=True)
@@ -33,21 +34,25 @@ class EveryFrameResult:
 
 
 def poses_in_every_frame(
-    run: Run, toss: int, done: Done, first: tuple[int, Done], scale_sigma: float, alone: Done | None, held: bool
-) -> Done:
+    run: Run, toss: int, done: Done, first: tuple[int, Done], scale_sigma: float, alone: Done | None, held: bool,
+    fit: Done | None,
+) -> Done:  # fmt: skip
     """A stage's track of one toss in every frame that was recorded. `first`: the toss that comes first, and its track;
     `scale_sigma`: standard deviation of depth's scale; `alone`: the toss's first pass, where the track rests on a shape
-    that was fused from first passes; `held`: whether other tosses' frames hold it. What the tracker noted of its
-    frames goes with it where these are all frames."""
+    that was fused from first passes; `held`: whether other tosses' frames hold it; `fit`: each frame's residuals on the
+    shape that the track rests on. What the tracker noted of its frames goes with it where these are all frames."""
     kept = run.kept.get(toss)
     inputs = {f"track_{toss:02d}": done.key} if kept is None else {"thinned": done.key, "kept": kept.digest}
     inputs |= {"first": first[1].key} | ({} if alone is None else {"alone": alone.key})
+    inputs |= {} if fit is None else {"fit": fit.key}
 
     def compute(folder: Path) -> EveryFrameResult:
         track = read_track(done.folder, toss)
         if alone is not None:
             track = with_shape_error(track, read_track(alone.folder, toss), held)
         track = with_drift(track, run.noise.coarseness, held)
+        if fit is not None:
+            track = with_misfit(track, read_rows(fit.folder))
         defined = defining_pose(track, read_track(first[1].folder, first[0]))
         count = len(track.status)
         if kept is None:
