@@ -192,7 +192,7 @@ def learned(session: Session, folder: Path, seen: list[Seen], tracks: Sequence[O
     for toss, track in zip(seen, tracks):
         frames = session.toss(toss.number).rgbd(CAMERA)
         views.append(TossViews(frames, frames.depth_times_ns, toss.masks, track))
-    shape, used = learn_shape(views, session.calibration.camera(CAMERA), LearnConfig(), "cpu", Silent())
+    shape, used, _ = learn_shape(views, session.calibration.camera(CAMERA), LearnConfig(), "cpu", Silent())
     cpu_s = time.process_time() - start
     truth = trimesh.load(truth_of(folder) / "mesh.obj", force="mesh", process=False)
     mesh = trimesh.Trimesh(shape.vertices_m, shape.faces, process=False)

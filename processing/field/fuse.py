@@ -32,7 +32,7 @@ SEEN_BEHIND = 0.04
 """A cell that depth calls inside is unseen all the same where fewer than this share of the views say so: near an edge
 it only lies behind another face, and its own was in view of none."""
 LEAST_SEEN = 0.5
-"""Fewer sure views have not seen a cell: what only views show whose poses are guesses is one."""
+"""A cell that fewer sure views have looked at is unseen: what guesses alone show is a guess."""
 OFF_MASK = 0.2
 """An unseen cell is empty where more than this share of the views sees it beside the mask."""
 

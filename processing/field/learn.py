@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -53,21 +54,24 @@ def learn_shape(
     device: str,
     progress: Progress,
     prior_shape: ObjectShape | None = None,
-) -> tuple[ObjectShape, int]:
-    """The shape of an object in the frame that all tracks share, and how many views it was learned from. Where none of
-    them looks it is `prior_shape`, if there is one.
-
-    Raises BadInput where no tracked frame shows the object; where none is tracked, none with a pose.
+) -> tuple[ObjectShape, int, bool]:
+    """The shape of an object in the frame that all tracks share, how many views it was learned from, and whether poses
+    among theirs are sure. Where none of them looks it is `prior_shape`, if there is one. Raises BadInput where no frame
+    with a pose shows the object.
     """
-    views = chosen_views(tosses, camera, config, alike=not any_sure(tosses))
+    views, sure = _sure_or_all(tosses, camera, config)
     trained = train_field(views, config.field, device, progress, prior_shape)
     frame = tosses[0].track.object_frame
-    return extract_mesh(trained.field, trained.grid, frame, "neural field"), len(views)
+    return extract_mesh(trained.field, trained.grid, frame, "neural field"), len(views), sure
 
 
-def any_sure(tosses: Sequence[TossViews]) -> bool:
-    """Whether there are tracked frames to learn from. (What guesses show is a guess, but tells more than nothing.)"""
-    return any("tracked" in t.track.status for t in tosses)
+def _sure_or_all(tosses: Sequence[TossViews], camera: CameraModel, config: LearnConfig) -> tuple[list[FieldView], bool]:
+    """The views by how sure their poses are; where none is, all alike, for what guesses show is a guess, but tells more
+    than nothing."""
+    if any("tracked" in t.track.status for t in tosses):
+        with suppress(BadInput):  # by their covariances they may be guesses all the same
+            return chosen_views(tosses, camera, config), True
+    return chosen_views(tosses, camera, config, alike=True), False
 
 
 def chosen_views(

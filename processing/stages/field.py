@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from processing.field.learn import LearnConfig, any_sure, learn_shape
+from processing.field.learn import LearnConfig, learn_shape
 from processing.images import Images, track_and_image_keys
 from processing.run import Run
 from processing.sensor.noise import DepthNoise
@@ -39,10 +39,10 @@ def learn_field(
         views = [images[t].open().views(read_track(done.folder, t)) for t, done in tracks.items()]
         body = None if prior_shape is None else read_shape(prior_shape.folder)
         progress = run.progress(f"{name}: shape")
-        shape, used = learn_shape(views, run.camera, config, run.device, progress, body)
+        shape, used, sure = learn_shape(views, run.camera, config, run.device, progress, body)
         write_shape(folder, shape)
         unseen = 0.0 if shape.observed is None else float((~shape.observed).mean())
-        return FieldResult(used, len(shape.vertices_m), round(unseen, 4), any_sure(views))
+        return FieldResult(used, len(shape.vertices_m), round(unseen, 4), sure)
 
     return run.store.run("field", VERSION, plain(config), inputs, FieldResult, compute)
 

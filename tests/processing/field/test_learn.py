@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from processing.field.learn import SURE_M, LearnConfig, TossViews, chosen_views, surface_sigma_m
+from processing.field.learn import SURE_M, LearnConfig, TossViews, _sure_or_all, chosen_views, surface_sigma_m
 from recordings.errors import BadInput
 from recordings.geometry import rotation_exp
 from recordings.tracks import ObjectTrack, Status
@@ -77,3 +77,15 @@ def test_where_all_are_guesses_nothing_is_learned_unless_they_are_taken_alike(ti
     with pytest.raises(BadInput, match="no frame has a pose that is sure"):
         chosen_views([lost], tiny_world.camera, LearnConfig())
     assert len(chosen_views([lost], tiny_world.camera, LearnConfig(), alike=True)) == len(seen.frames)
+
+
+def test_frames_that_are_called_tracked_and_claim_nothing_are_learned_from_alike(
+    tiny_world: Any, seen: TossViews
+) -> None:
+    lost = with_doubt(seen, list(range(len(seen.track.status))), sigma_rad=100.0)
+    called = replace(lost, track=replace(lost.track, status=seen.track.status))
+    for toss, sure in ((seen, True), (lost, False), (called, False)):
+        views, found = _sure_or_all([toss], tiny_world.camera, LearnConfig())
+        assert found == sure
+        assert len(views) == len(seen.frames)
+        np.testing.assert_allclose([view.weight for view in views], 1.0, atol=0.002)
