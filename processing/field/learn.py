@@ -24,7 +24,8 @@ from recordings.results.folder import RobotMasks
 from recordings.tracks import ObjectShape, ObjectTrack
 
 SURE_M = 0.004
-"""A view whose pose may be off by so much on the body (root mean square) counts half, one that is surer more."""
+"""A view whose pose may be off by so much on the body (root mean square) counts half, one that is surer more
+(docs/decisions/fusion-weights.md)."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +90,7 @@ def chosen_views(
     views = without_strays([view for _, view in found])
     if views and not alike:
         points_m = np.concatenate([object_points(view) for view in views])
-        sigmas_m = [surface_sigma_m(t.track, int(i), points_m) for (t, i), _ in found]
+        sigmas_m = surface_sigmas_m([(t.track, int(i)) for (t, i), _ in found], points_m)
         views = [replace(v, weight=SURE_M**2 / (SURE_M**2 + s**2)) for v, s in zip(views, sigmas_m)]
     if sum(view.weight for view in views) < LEAST_SEEN:
         raise BadInput(
@@ -99,17 +100,22 @@ def chosen_views(
     return views
 
 
-def surface_sigma_m(track: ObjectTrack, position: int, points_m: Float[Array, "n 3"]) -> float:
-    """Root mean square, metres, by which points of the body (object frame) are off where a frame's pose puts them, as
-    its covariance says; 0 where that is not known, which is no doubt."""
-    pose, covariance = track.camera_from_object[position], track.covariance[position]
-    if not np.isfinite(covariance).all() or len(points_m) == 0:
-        return 0.0
-    middle, second = pose[:3, :3] @ points_m.mean(axis=0), pose[:3, :3] @ (points_m.T @ points_m) @ pose[:3, :3].T
-    second = second / len(points_m)
-    turn, shift, both = covariance[:3, :3], covariance[3:, 3:], covariance[:3, 3:]
-    turned = np.sum(turn * (np.trace(second) * np.eye(3) - second)) - 2 * np.trace(skew(middle) @ both)
-    return float(np.sqrt(max(turned + np.trace(shift), 0.0)))
+def surface_sigmas_m(places: Sequence[tuple[ObjectTrack, int]], points_m: Float[Array, "n 3"]) -> Float[Array, " p"]:
+    """For frames of tracks the root mean square, metres, by which points of the body (object frame) are off where the
+    frame's pose puts them, as its covariance says; 0 where that is not known, which is no doubt."""
+    sigmas_m = np.zeros(len(places))
+    if len(points_m) == 0:
+        return sigmas_m
+    mean, squares = points_m.mean(axis=0), points_m.T @ points_m
+    for k, (track, i) in enumerate(places):
+        rotation, covariance = track.camera_from_object[i, :3, :3], track.covariance[i]
+        if not np.isfinite(covariance).all():
+            continue
+        middle, second = rotation @ mean, rotation @ squares @ rotation.T / len(points_m)
+        turn, shift, both = covariance[:3, :3], covariance[3:, 3:], covariance[:3, 3:]
+        turned = np.sum(turn * (np.trace(second) * np.eye(3) - second)) - 2 * np.trace(skew(middle) @ both)
+        sigmas_m[k] = np.sqrt(max(turned + np.trace(shift), 0.0))
+    return sigmas_m
 
 
 def _view(toss: TossViews, position: int, camera: CameraModel) -> FieldView | None:

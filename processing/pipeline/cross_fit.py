@@ -17,7 +17,7 @@ from numpy import ndarray as Array
 from scipy.special import ndtri
 
 from processing.images import Images
-from processing.refine.image_residuals import FAR_M, Explained, difference
+from processing.refine.image_residuals import ALIKE, FAR_M, Explained, difference
 from processing.run import Run, each
 from processing.stages.adjust import adjust
 from processing.stages.carry import carry
@@ -30,9 +30,6 @@ from recordings.errors import BadInput
 TURNS, GAIN = 6, 0.1
 """A further turn is for tosses whose misfit fell by more than this in the last one, and the second for those that the
 first left open, too: on shapes that it corrected."""
-ALIKE = 0.1
-"""Standard deviation by which the logarithms of residuals differ where nothing does: over a plain box's four ways of
-lying (choose-000) .04 of chromaticity, .14 of depth with outline; more frames do not average that out."""
 SURE_NATS = 0.5 * float(ndtri(0.95)) ** 2
 """What chance makes of a Gaussian once in twenty times (one side)."""
 SPOILED_NATS = SURE_NATS + float(np.log(7.0))

@@ -37,11 +37,14 @@ def write_record(
     moved = posed_together(last.tracks, alone)
     on_shape = {t: alone[t] for t in moved if not isinstance(last.tracks[t].result, (RegisterResult, CarryResult))}
     held = on_shape.keys() & sharing(last.tracks)
-    fits = each(run, on_shape, lambda t: judge(run, f"toss {t}", {t: tracks[t]}, {t: shapes[t]}, images, True))
+    fits = each(
+        run, on_shape, lambda t: judge(run, f"toss {t}", {t: tracks[t]}, {t: shapes[t]}, images, each_frame=True)
+    )
 
     def of_toss(t: int) -> TossRecord:
-        of_shape = on_shape.get(t), t in held, fits.get(t)
-        poses = poses_in_every_frame(run, t, tracks[t], (first, tracks[first]), scale_sigma, *of_shape)
+        of_first = first, tracks[first]
+        before, fit = on_shape.get(t), fits.get(t)
+        poses = poses_in_every_frame(run, t, tracks[t], of_first, scale_sigma, before, t in held, fit)
         return TossRecord(t, poses.name, shapes[t].name, masks_in_every_frame(run, t, masks[t]).name)
 
     tosses = tuple(of_toss(t) for t in run.recorded)

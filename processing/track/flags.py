@@ -15,7 +15,6 @@ from processing.sensor import noise
 from processing.sensor import view_layout as lay
 from processing.sensor.view_store import ViewStore
 from processing.track.beam import Scene
-from recordings.constants import MAD_TO_SIGMA
 from recordings.geometry import rotation_log, skew
 from recordings.tracks import ObjectTrack, Status
 
@@ -267,27 +266,6 @@ def with_drift(track: ObjectTrack, coarseness: float, held: bool) -> ObjectTrack
     fits, and no covariance about one solution shows it. What other tosses show of the object ends most such chains.
     """
     return replace(track, covariance=track.covariance * max(1.0, coarseness) ** (HELD_DRIFT if held else 1.0))
-
-
-OUTLIER = 3.5
-"""Modified z-score beyond which one of many does not belong to them (Iglewicz and Hoaglin 1993)."""
-LEAST_SPREAD = 0.1
-"""By so much the logarithms of residuals differ where nothing does (`cross_fit.ALIKE`)."""
-
-
-def with_misfit(track: ObjectTrack, residuals: Float[Array, "m 6"]) -> ObjectTrack:
-    """The track, the standard deviations of frames that the shape explains so much worse than the toss's others that
-    chance does not make it as many times as large as their residual of depth or outline is (Birge 1932). `residuals`:
-    rows of `Explained` (toss, frame, depth, outline, ...)."""
-    if len(residuals) == 0:
-        return track
-    frames, logs = residuals[:, 1].astype(int), np.log(np.maximum(residuals[:, 2:4], 1e-6))
-    above = logs - np.median(logs, axis=0)
-    spread = np.maximum(MAD_TO_SIGMA * np.median(np.abs(above), axis=0), LEAST_SPREAD)
-    times = np.where(above > OUTLIER * spread, np.exp(above), 1.0).max(axis=1)
-    covariance = track.covariance.copy()
-    covariance[frames] *= times[:, None, None] ** 2
-    return replace(track, covariance=covariance)
 
 
 def published(track: ObjectTrack) -> ObjectTrack:

@@ -12,7 +12,7 @@ import pytest
 from processing.pipeline.record import posed_together, sharing
 from processing.segment.background.depth_scale import DepthScaleSettings, posterior_sigma
 from processing.sensor.noise import FINE, DepthNoise
-from processing.stages.recording.every_frame import defining_pose, scaled_by_chance
+from processing.stages.recording.every_frame import defining_pose, scaled_by_chance, with_misfit
 from processing.store import Done
 from processing.track.flags import (
     HELD_SHAPE_DEG,
@@ -21,7 +21,6 @@ from processing.track.flags import (
     camera_covariance,
     published,
     with_drift,
-    with_misfit,
     with_shape_error,
 )
 from recordings.geometry import rotation_exp

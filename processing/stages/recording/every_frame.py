@@ -13,11 +13,12 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray as Array
 
-from processing.refine.image_residuals import read_rows
+from processing.refine.image_residuals import ALIKE, read_rows
 from processing.run import Run
 from processing.sensor.still import Kept, whole_session
 from processing.store import Done
-from processing.track.flags import published, with_drift, with_misfit, with_shape_error
+from processing.track.flags import published, with_drift, with_shape_error
+from recordings.constants import MAD_TO_SIGMA
 from recordings.results.folder import RobotMasks, read_masks, read_track, write_masks, write_track
 from recordings.results.track_notes import FIT, NOTES
 from recordings.tracks import ObjectTrack
@@ -101,6 +102,25 @@ def defining_pose(track: ObjectTrack, first: ObjectTrack) -> Float[Array, "4 4"]
         if one.object_frame == track.object_frame and len(posed):
             return one.camera_from_object[posed[0]]
     return np.full((4, 4), np.nan)
+
+
+OUTLIER = 3.5
+"""Modified z-score beyond which one of many does not belong to them (Iglewicz and Hoaglin 1993)."""
+
+
+def with_misfit(track: ObjectTrack, residuals: Float[Array, "m 6"]) -> ObjectTrack:
+    """The track, the standard deviations of frames that the shape explains so much worse than the toss's others that
+    chance does not make it as many times as large as their residual of depth or outline is (Birge 1932). `residuals`:
+    rows of `Explained` (toss, frame, depth, outline, ...)."""
+    if len(residuals) == 0:
+        return track
+    frames, logs = residuals[:, 1].astype(int), np.log(np.maximum(residuals[:, 2:4], 1e-6))
+    above = logs - np.median(logs, axis=0)
+    spread = np.maximum(MAD_TO_SIGMA * np.median(np.abs(above), axis=0), ALIKE)
+    times = np.where(above > OUTLIER * spread, np.exp(above), 1.0).max(axis=1)
+    covariance = track.covariance.copy()
+    covariance[frames] *= times[:, None, None] ** 2
+    return replace(track, covariance=covariance)
 
 
 def scaled_by_chance(track: ObjectTrack, defined: Float[Array, "4 4"], sigma: float) -> ObjectTrack:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from processing.field.learn import SURE_M, LearnConfig, TossViews, _sure_or_all, chosen_views, surface_sigma_m
+from processing.field.learn import SURE_M, LearnConfig, TossViews, _sure_or_all, chosen_views, surface_sigmas_m
 from recordings.errors import BadInput
 from recordings.geometry import rotation_exp
 from recordings.tracks import ObjectTrack, Status
@@ -51,9 +51,9 @@ def test_points_of_the_body_are_as_far_off_as_poses_drawn_from_the_covariance_pu
     for error in rng.normal(size=(4000, 6)) @ root.T:
         turned = rotation_exp(error[:3]) @ pose[:3, :3]
         moved_m2.append(np.sum((points_m @ (turned - pose[:3, :3]).T + error[3:]) ** 2, axis=1).mean())
-    assert surface_sigma_m(track, 0, points_m) == pytest.approx(np.sqrt(np.mean(moved_m2)), rel=0.03)
+    assert surface_sigmas_m([(track, 0)], points_m)[0] == pytest.approx(np.sqrt(np.mean(moved_m2)), rel=0.03)
     unknown = replace(track, covariance=np.full((1, 6, 6), np.nan))
-    assert surface_sigma_m(unknown, 0, points_m) == 0.0
+    assert surface_sigmas_m([(unknown, 0)], points_m)[0] == 0.0
 
 
 def test_sure_views_count_wholly_and_guesses_by_how_far_off_they_may_be(tiny_world: Any, seen: TossViews) -> None:
