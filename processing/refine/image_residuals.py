@@ -238,10 +238,12 @@ class ShapeDrawer:
         """The shape at a pose."""
         depth_m, face, weight = self._renderer.hits(camera_from_object)
         seen = depth_m > 0
-        normal = np.where(seen[..., None], self._normals[face], np.float32(0))
+        met = face[seen]
+        normal = np.zeros((*depth_m.shape, 3), dtype=np.float32)
+        normal[seen] = self._normals[met]
         if self._rgb is None:
             return Drawn(depth_m, None, normal)
         rgb = np.zeros((*depth_m.shape, 3), dtype=np.uint8)
-        corners = self._rgb[self._faces[face[seen]]]
+        corners = self._rgb[self._faces[met]]
         rgb[seen] = np.clip((corners * weight[seen][..., None]).sum(1), 0, 255).astype(np.uint8)
         return Drawn(depth_m, rgb, normal)

@@ -193,14 +193,16 @@ def test_the_worst_toss_comes_first_and_every_toss_once(
 def test_it_goes_on_with_the_tosses_that_gained(
     depth_mm: list[float], turns: int, monkeypatch: pytest.MonkeyPatch, tiny_world: Any, tmp_path: Path
 ) -> None:
-    """Toss 1 fits so after each turn; toss 0 gains nothing."""
+    """Toss 1 fits so after each turn; toss 0 gains nothing. Located anew they may be in the first turn only."""
     tosses = Tosses(tiny_world, tmp_path, 2)
     tracks = {t: Done(tmp_path, f"{t} 0", SURE, False) for t in (0, 1)}
     asked: list[str] = []
+    located: list[bool] = []
 
-    def chosen(_: Any, before: Done, *__: Any) -> Done:
+    def chosen(_: Any, before: Done, *others: Any) -> Done:
         toss, turn = before.key.split()
         asked.append(toss)
+        located.append(others[-1])
         return before if toss == "0" else Done(tmp_path, f"1 {int(turn) + 1}", SURE, False)
 
     def on_itself(_: Any, done: Done, __: Any) -> Explained:
@@ -212,6 +214,7 @@ def test_it_goes_on_with_the_tosses_that_gained(
     monkeypatch.setattr(cross_fit, "fused", lambda *_: tracks[0])
     cross_fit.cross_fitted(tosses.run, tosses.images, tracks, tracks)
     assert asked == ["1", "0", *["1"] * (turns - 1)]
+    assert located == [True, True, *[False] * (turns - 1)]
 
 
 def test_one_toss_stays_as_it_is(tiny_world: Any, tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray as Array
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import cholesky, solve_triangular
 
 from processing.sensor import view_layout as lay
 from processing.sensor.noise import DepthNoise
@@ -87,15 +87,18 @@ class DepthErrors:
         right[6 * count :] += np.einsum("cij,cj->ci", self._prior, self.relative).ravel()
         crossed = whole[6 * count :, : 6 * count]
         sides = np.concatenate([crossed, right[6 * count :, None]], 1)
-        self._gain = cho_solve(cho_factor(among, lower=True, overwrite_a=True), sides)
-        poses_only = whole[: 6 * count, : 6 * count] - crossed.T @ self._gain[:, :-1]
+        self._root = cholesky(among, lower=True, overwrite_a=True, check_finite=False)
+        self._half = solve_triangular(self._root, sides, lower=True, check_finite=False)
+        known = self._half[:, :-1].T @ self._half
+        poses_only = whole[: 6 * count, : 6 * count] - known[:, :-1]
         H += poses_only.reshape(count, 6, count, 6).transpose(0, 2, 1, 3) / self._shared
-        g += (right[: 6 * count] - crossed.T @ self._gain[:, -1]).reshape(count, 6) / self._shared
+        g += (right[: 6 * count] - known[:, -1]).reshape(count, 6) / self._shared
         return figures
 
     def follow(self, twists: Float[Array, "f 6"]) -> None:
         """The errors that go with a step of the poses since the last `add`."""
-        step = -(self._gain[:, -1] + self._gain[:, :-1] @ twists.ravel())
+        left = self._half[:, -1] + self._half[:, :-1] @ twists.ravel()
+        step = -solve_triangular(self._root, left, lower=True, trans="T", check_finite=False)
         moved = self.relative + np.clip(step, -MOST_STEP, MOST_STEP).reshape(self.relative.shape)
         self.relative = np.clip(moved, -MOST_ERROR, MOST_ERROR)
 
