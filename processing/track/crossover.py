@@ -27,6 +27,7 @@ from processing.track.hypotheses import (
     own_cost,
     refined,
 )
+from processing.track.pairs import KnownFigures
 
 Cut = tuple[int, int, int]
 """Positions of two parents among all, and the last frame that is the first one's."""
@@ -117,7 +118,8 @@ def _children(
     likeliest = [cut for _, cut in sorted(cuts)[: config.compared]]
     tried.update(likeliest)
     children = [crossed_at(everyone[a], everyone[b], cut, first, best) for a, b, cut in likeliest]
-    children.sort(key=lambda child: own_cost(scene, child, refinement))
+    figures = KnownFigures()
+    children.sort(key=lambda child: own_cost(scene, child, refinement, figures))
     chosen: list[TrajectoryHypothesis] = []
     known = [everyone[i].joint.poses for i in parents]
     for child in children:

@@ -28,7 +28,7 @@ from processing.track.joint_refinement import (
     round_views,
     steady_motion,
 )
-from processing.track.pairs import compared
+from processing.track.pairs import KnownFigures
 from processing.track.revolution.axis import Axis, open_axis
 from processing.track.revolution.azimuth import (
     AzimuthConfig,
@@ -308,8 +308,11 @@ def motion_of(scene: Scene, poses: Float[Array, "v 4 4"], use: Bool[Array, " n"]
     return Motion(times_s, whose, scene.gravity_camera_m_s2, center_m, still, _carried(scene, use))
 
 
-def own_cost(scene: Scene, hypothesis: TrajectoryHypothesis, config: HypothesisConfig) -> float:
-    """What the frames' own pairs and their motion cost at the poses, as `cost` does, whatever else these rest on."""
+def own_cost(
+    scene: Scene, hypothesis: TrajectoryHypothesis, config: HypothesisConfig, known: KnownFigures | None = None
+) -> float:
+    """What the frames' own pairs and their motion cost at the poses, as `cost` does, whatever else these rest on.
+    `known`: figures of the scene's pairs so far."""
     n, use, poses = len(scene.times_s), hypothesis.use, hypothesis.joint.poses
     motion, store = hypothesis.motion, scene.store
     frames = np.concatenate([use, np.zeros(len(poses) - n, dtype=bool)])
@@ -317,7 +320,7 @@ def own_cost(scene: Scene, hypothesis: TrajectoryHypothesis, config: HypothesisC
     fit = 0.0
     if len(pairs):
         distance_m = float(np.median(np.linalg.norm(store.center_m[:n][use], axis=1)))
-        _, _, figures = compared(store, poses, pairs, rows(config.graph.schedule, distance_m)[-1], True)
+        figures = (known or KnownFigures()).of(store, poses, pairs, rows(config.graph.schedule, distance_m)[-1])
         fit = float(np.nanmean(per_view(pairs, figures, len(poses))[0][:n]))
     return fit + mean_motion_cost(poses[:n], use, scene, hypothesis.center_m, config.motion)
 

@@ -46,6 +46,31 @@ def compared(
     return blocks, gradients, figures
 
 
+DIGITS = 9
+"""Of relative poses (m, cosines) that are taken for the same: far below what costs notice."""
+
+
+class KnownFigures:
+    """Figures of pairs of views by how the two lie to each other, each computed once: trajectories that are put
+    together of the same parts share most of them."""
+
+    def __init__(self) -> None:
+        self._known: dict[tuple[bytes, int, int, bytes], Float[Array, "3"]] = {}
+
+    def of(
+        self, store: ViewStore, poses: Float[Array, "n 4 4"], pairs: Int[Array, "m 2"], row: Float[Array, "7"]
+    ) -> Float[Array, "m 3"]:
+        """As `compared` gives them."""
+        scales = row.tobytes()
+        relative = np.round(poses[pairs[:, 1]] @ np.linalg.inv(poses[pairs[:, 0]]), DIGITS) + 0.0  # no -0.0
+        keys = [(scales, i, k, lie.tobytes()) for (i, k), lie in zip(pairs.tolist(), relative, strict=True)]
+        new = [m for m, key in enumerate(keys) if key not in self._known]
+        if new:
+            figures = compared(store, poses, pairs[new], row, shaded=False)[2]
+            self._known |= {keys[m]: figure for m, figure in zip(new, figures, strict=True)}
+        return np.array([self._known[key] for key in keys]).reshape(-1, 3)
+
+
 def eliminated(
     blocks: Float[Array, "m 6 6"], gradients: Float[Array, "m 6"], crossed: Float[Array, "m 6 s"],
     among: Float[Array, "m t s"],

@@ -8,12 +8,15 @@ from typing import Any
 import numpy as np
 import pytest
 
+import processing.track.pairs as pairs_module
 from processing.features.sift import Sift
 from processing.motion.interpolate import carried_on
 from processing.track.appearance_ratio import AppearanceRatioConfig, log_likelihood_ratio
 from processing.track.beam import Hypothesis, Scene, seconds
 from processing.track.hypotheses import HypothesisConfig, TrajectoryHypothesis, own_cost
 from processing.track.joint_refinement import GraphConfig, Motion, Refined, choose_pairs
+from processing.track.pairs import KnownFigures
+from processing.track.schedule import rows
 from processing.track.track_toss import TrackConfig, views_of
 from recordings.geometry import rotation_exp
 from recordings.progress import Silent
@@ -137,3 +140,30 @@ def test_a_drawn_shape_takes_no_part_in_what_the_frames_own_pairs_cost(tiny_worl
     scene, poses = seen_turning(tiny_world, ONE_COLOR)
     alone, on_shape = (own_cost(scene, held_at(scene, poses, drawn), HypothesisConfig()) for drawn in (0, 2))
     assert alone == on_shape > 0
+
+
+def test_pairs_that_lie_to_each_other_as_others_did_are_compared_once(
+    tiny_world: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene, poses = seen_turning(tiny_world, ONE_COLOR)
+    pairs = np.array([(0, 1), (1, 0), (1, 2), (4, 6)])
+    row = rows(HypothesisConfig().graph.schedule, 0.5)[-1]
+    asked: list[int] = []
+
+    compared = pairs_module.compared
+
+    def counted(store: Any, at: Any, some: np.ndarray, *more: Any, **kinds: Any) -> Any:
+        asked.append(len(some))
+        return compared(store, at, some, *more, **kinds)
+
+    monkeypatch.setattr(pairs_module, "compared", counted)
+    known = KnownFigures()
+    first = known.of(scene.store, poses, pairs, row)
+    elsewhere = poses @ turning([25.0])[0]  # all of it in another object frame
+    second = known.of(scene.store, elsewhere, pairs, row)
+    part = elsewhere.copy()
+    part[3:] = part[3:] @ turning([5.0])[0]  # as a child of two parents, of which one pair reaches over the cut
+    known.of(scene.store, part, np.concatenate([pairs, [(2, 3)]]), row)
+    assert asked == [4, 1]
+    np.testing.assert_array_equal(second, first)
+    np.testing.assert_array_equal(first, compared(scene.store, poses, pairs, row, True)[2])
