@@ -32,6 +32,11 @@ def turn_between(after: Float[Array, "4 4"], before: Float[Array, "4 4"]) -> Flo
     return axis * (math.atan2(sine, cosine) / sine) if sine > 1e-9 else axis
 
 
+def turns_between(after: Float[Array, "n 4 4"], before: Float[Array, "n 4 4"]) -> Float[Array, "n 3"]:
+    """`turn_between` of many."""
+    return np.asarray(Rotation.from_matrix(after[:, :3, :3] @ before[:, :3, :3].transpose(0, 2, 1)).as_rotvec())
+
+
 def moved(
     before: Float[Array, "4 4"],
     now: Float[Array, "4 4"],

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Float
@@ -27,17 +28,19 @@ class MotionConfig:
     shift_cost: float = 0.04
 
 
+Some = TypeVar("Some", float, Float[Array, " n"])
+"""One, or one of each of many."""
 FREE_CHANGE = 0.25
 """No torque turns a flying body, yet its spin changes (Euler's equations): for a rod or a disc that spins askew by up
 to half the spin's square in a second. Half of that bound is the standard deviation for a body of unknown inertia."""
 
 
-def free_change_rad_s(spin_rad_s: float, step_s: float) -> float:
+def free_change_rad_s(spin_rad_s: Some, step_s: Some) -> Some:
     """Standard deviation of the change of a free body's spin over a step."""
     return FREE_CHANGE * spin_rad_s**2 * step_s
 
 
-def free_jerk_rad_s(spin_rad_s: float, step_s: float) -> float:
+def free_jerk_rad_s(spin_rad_s: Some, step_s: Some) -> Some:
     """Standard deviation of the change of that change over the next step: it turns with the body."""
     return FREE_CHANGE**2 * spin_rad_s**3 * step_s**2
 

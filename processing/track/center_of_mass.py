@@ -31,15 +31,14 @@ def center_of_mass(poses: Float[Array, "n 4 4"], use: Bool[Array, " n"], scene: 
     motion = Motion(
         scene.times_s, np.zeros(len(poses), dtype=np.int64), scene.gravity_camera_m_s2, scene.center_m, ~use
     )
-    fly = -scene.gravity_camera_m_s2
-    free = []
-    for a, b, c in zip(index, index[1:], index[2:]):
-        steps = scene.times_s[[a, b, c]]
-        residual, _ = motion_residual((poses[a], poses[b], poses[c]), steps, motion)
-        centers = [poses[x][:3, :3] @ scene.center_m + poses[x][:3, 3] for x in (a, b, c)]
-        change = (centers[2] - centers[1]) / (steps[2] - steps[1]) - (centers[1] - centers[0]) / (steps[1] - steps[0])
-        falls = float(change @ -fly) / (0.5 * (steps[2] - steps[0])) > 0.6 * float(fly @ fly)
-        free.append(bool(falls and np.linalg.norm(residual[:3]) < 3.0))
+    three = np.stack([index[:-2], index[1:-1], index[2:]], axis=1)
+    times_s, gravity = scene.times_s[three], scene.gravity_camera_m_s2
+    residual, _ = motion_residual(poses[three], times_s, motion)
+    centers = poses[three][..., :3, :3] @ scene.center_m + poses[three][..., :3, 3]
+    speeds = np.diff(centers, axis=1) / np.diff(times_s, axis=1)[:, :, None]
+    span_s = times_s[:, 2] - times_s[:, 0]
+    falls = (speeds[:, 1] - speeds[:, 0]) @ gravity / (0.5 * span_s) > 0.6 * float(gravity @ gravity)
+    free = (falls & (np.linalg.norm(residual[:, :3], axis=1) < 3.0)).tolist()
     run = _longest_run(free)
     flying = index[run.start : run.stop + 2] if run.stop > run.start else index[:0]
     return flight_center(poses, scene.times_s, scene.gravity_camera_m_s2, flying, scene.center_m)

@@ -64,9 +64,11 @@ def unfit(store: ViewStore, cost: Float[Array, " n"], config: FlagConfig) -> int
 def per_view(pairs: Int[Array, "m 2"], figures: Float[Array, "m 3"], n: int) -> tuple[Array, Array]:
     """Median cost and share on the surface over the pairs that a view is in; NaN where it is in none."""
     cost, on = np.full(n, np.nan), np.full(n, np.nan)
-    for i in np.unique(pairs):
-        mine = (pairs == i).any(1)
-        cost[i], on[i] = np.median(figures[mine, 0]), np.median(figures[mine, 1])
+    ends = pairs.T.ravel()
+    order = np.argsort(ends, kind="stable")
+    views, first = np.unique(ends[order], return_index=True)
+    for i, mine in zip(views, np.split(order % max(len(pairs), 1), first[1:])):
+        cost[i], on[i] = np.median(figures[mine, :2], axis=0)
     return cost, on
 
 

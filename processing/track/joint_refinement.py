@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray as Array
 
 from processing.motion import se3_kernels as se3
-from processing.motion.interpolate import turn_between
+from processing.motion.interpolate import turns_between
 from processing.motion.motion_prior import free_change_rad_s, free_jerk_rad_s
 from processing.sensor import noise
 from processing.sensor.view_store import ViewStore
@@ -138,21 +138,26 @@ def choose_pairs(
     directions = view_directions(poses[index], center_m)
     cosine = np.clip(directions @ directions.T, -1, 1)
     chosen: set[tuple[int, int]] = set()
-    stay = np.cumsum(~still)
-    for a, i in enumerate(index):
-        later = [int(j) for j in index[a + 1 : a + 1 + config.neighbours] if toss[j] == toss[i]]
-        taken = [int(i), *later]
-        chosen.update((int(i), j) for j in later)
+    whose, stay, views = (
+        toss.tolist(),
+        np.cumsum(~still).tolist(),
+        index.tolist(),
+    )  # plain numbers: what follows is slow
+    far, wide = np.cos(np.radians(config.co_visible_deg)), np.cos(np.radians(config.wide_deg))
+    for a, i in enumerate(views):
+        later = [j for j in views[a + 1 : a + 1 + config.neighbours] if whose[j] == whose[i]]
+        taken = [i, *later]
+        chosen.update((i, j) for j in later)
         wanted = config.loops
-        for b in np.argsort(-cosine[a]):
-            j = int(index[b])
+        for b in np.argsort(-cosine[a]).tolist():
+            j = views[b]
             few = config.loops - wanted < config.least_loops
-            if wanted == 0 or cosine[a, b] < np.cos(np.radians(config.wide_deg if few else config.co_visible_deg)):
+            if wanted == 0 or cosine[a, b] < (wide if few else far):
                 break
-            if any(toss[j] == toss[t] and (abs(j - t) < config.spread_in_time or stay[j] == stay[t]) for t in taken):
+            if any(whose[j] == whose[t] and (abs(j - t) < config.spread_in_time or stay[j] == stay[t]) for t in taken):
                 continue
             taken.append(j)
-            chosen.add((min(int(i), j), max(int(i), j)))
+            chosen.add((min(i, j), max(i, j)))
             wanted -= 1
     one_way = np.array(sorted(chosen), dtype=np.int64).reshape(-1, 2)
     return np.concatenate([one_way, one_way[:, ::-1]])
@@ -259,24 +264,17 @@ def _add_motion(
     _add_ties(H, g, poses, index, place, motion, config)
     if config.jerk_rad_s is not None:
         _add_smooth(H, g, poses, index, place, motion, config.jerk_rad_s)
-    for a, b, c in zip(index, index[1:], index[2:]):
-        if motion.toss[a] != motion.toss[c] or motion.still[b] or motion.still[c]:
-            continue
-        residual, jacobians = motion_residual((poses[a], poses[b], poses[c]), motion.times_s[[a, b, c]], motion)
-        turn = turn_between(poses[c], poses[a]) / (motion.times_s[c] - motion.times_s[a])
-        free = free_change_rad_s(float(np.linalg.norm(turn)), 0.5 * (motion.times_s[c] - motion.times_s[a]))
-        sigma_rad_s = float(np.hypot(config.spin_change_rad_s, free))
-        spin, speed = residual[:3] / sigma_rad_s, residual[3:] / config.velocity_change_m_s
-        w_spin = _accepted(spin) / sigma_rad_s**2
-        w_speed = _accepted(speed) / config.velocity_change_m_s**2
-        w = np.array([w_spin] * 3 + [w_speed] * 3)
-        for x, jx in zip((a, b, c), jacobians):
-            if place[x] < 0:
-                continue
-            g[place[x]] += jx.T @ (w * residual)
-            for y, jy in zip((a, b, c), jacobians):
-                if place[y] >= 0:
-                    H[place[x], place[y]] += jx.T @ (w[:, None] * jy)
+    three = np.stack([index[:-2], index[1:-1], index[2:]], axis=1)
+    a, b, c = three.T
+    three = three[(motion.toss[a] == motion.toss[c]) & ~motion.still[b] & ~motion.still[c]]
+    times_s = motion.times_s[three]
+    residual, jacobians = motion_residual(poses[three], times_s, motion)
+    span_s = times_s[:, 2] - times_s[:, 0]
+    fast = np.linalg.norm(turns_between(poses[three[:, 2]], poses[three[:, 0]]), axis=1) / span_s
+    spin_sigma = np.hypot(config.spin_change_rad_s, free_change_rad_s(fast, 0.5 * span_s))
+    sigma = np.column_stack([spin_sigma, np.full(len(three), config.velocity_change_m_s)])
+    weight = _accepted(residual.reshape(-1, 2, 3) / sigma[:, :, None]) / sigma**2
+    _add_terms(H, g, place[three], jacobians, residual, np.repeat(weight, 3, axis=1))
 
 
 def _add_smooth(
@@ -284,30 +282,40 @@ def _add_smooth(
     place: Int[Array, " n"], motion: Motion, sigma_rad_s: float,
 ) -> None:  # fmt: skip
     """Adds the pull towards a steady change of spin over each four views in a row (rad/s, camera axes; `_accepted`)."""
-    for four in zip(index, index[1:], index[2:], index[3:]):
-        if len({int(motion.toss[i]) for i in four}) > 1 or motion.still[list(four[1:])].any():
-            continue
-        steps = np.diff(motion.times_s[list(four)])
-        spins = [turn_between(poses[b], poses[a]) / s for a, b, s in zip(four, four[1:], steps)]
-        residual = spins[2] - 2 * spins[1] + spins[0]
-        fast = float(np.median(np.linalg.norm(spins, axis=1)))
-        sigma = float(np.hypot(sigma_rad_s, free_jerk_rad_s(fast, float(steps.mean()))))
-        w = _accepted(residual / sigma) / sigma**2
-        shares = (-1 / steps[0], 1 / steps[0] + 2 / steps[1], -2 / steps[1] - 1 / steps[2], 1 / steps[2])
-        jacobians = [-share * poses[i][:3, :3] for i, share in zip(four, shares)]
-        for x, jx in zip(four, jacobians):
-            if place[x] < 0:
-                continue
-            g[place[x], 3:] += w * jx.T @ residual
-            for y, jy in zip(four, jacobians):
-                if place[y] >= 0:
-                    H[place[x], place[y], 3:, 3:] += w * jx.T @ jy
+    four = np.stack([index[:-3], index[1:-2], index[2:-1], index[3:]], axis=1)
+    four = four[(motion.toss[four] == motion.toss[four[:, :1]]).all(axis=1) & ~motion.still[four[:, 1:]].any(axis=1)]
+    steps = np.diff(motion.times_s[four], axis=1)
+    spins = np.stack([turns_between(poses[four[:, n + 1]], poses[four[:, n]]) for n in range(3)], axis=1)
+    spins /= steps[:, :, None]
+    residual = spins[:, 2] - 2 * spins[:, 1] + spins[:, 0]
+    fast = np.median(np.linalg.norm(spins, axis=2), axis=1)
+    sigma = np.hypot(sigma_rad_s, free_jerk_rad_s(fast, steps.mean(axis=1)))
+    weight = _accepted(residual / sigma[:, None]) / sigma**2
+    one, two, three = 1 / steps.T
+    shares = np.stack([-one, one + 2 * two, -2 * two - three, three], axis=1)
+    jacobians = np.zeros((*four.shape, 3, 6))
+    jacobians[..., 3:] = -shares[:, :, None, None] * poses[four][..., :3, :3]
+    _add_terms(H, g, place[four], jacobians, residual, np.repeat(weight[:, None], 3, axis=1))
 
 
-def _accepted(normalised: Float[Array, " d"]) -> float:
-    """Weight of a change of motion in standard deviations (Geman-McClure): an impact must not pull at all. A kernel
+def _add_terms(
+    H: Float[Array, "f f 6 6"], g: Float[Array, "f 6"], places: Int[Array, "m v"], jacobians: Float[Array, "m v r 6"],
+    residual: Float[Array, "m r"], weight: Float[Array, "m r"],
+) -> None:  # fmt: skip
+    """Adds residuals of several views each; `places`: each view's unknown, -1 where it is fixed."""
+    weighed, free = weight[:, None, :, None] * jacobians, places >= 0
+    np.add.at(g, places[free], np.einsum("mvrd,mr->mvd", weighed, residual)[free])
+    for x in range(places.shape[1]):
+        for y in range(places.shape[1]):
+            both = free[:, x] & free[:, y]
+            blocks = weighed[both, x].transpose(0, 2, 1) @ jacobians[both, y]
+            np.add.at(H, (places[both, x], places[both, y]), blocks)
+
+
+def _accepted(normalised: Float[Array, "*m d"]) -> Float[Array, "*m"]:
+    """Weight of changes of motion in standard deviations (Geman-McClure): an impact must not pull at all. A kernel
     whose pull fades slowly (Cauchy) turns small or blurred objects by tens of degrees where they hit the table."""
-    return float(geman_mcclure_weight(normalised @ normalised / 4.0))
+    return np.asarray(geman_mcclure_weight((normalised**2).sum(axis=-1) / 4.0))
 
 
 def _add_ties(
@@ -362,27 +370,23 @@ def _tie(
 
 
 def motion_residual(
-    three: tuple[Float[Array, "4 4"], Float[Array, "4 4"], Float[Array, "4 4"]],
-    times_s: Float[Array, "3"],
-    motion: Motion,
-) -> tuple[Float[Array, "6"], list[Float[Array, "6 6"]]]:
-    """Change of spin and of velocity over three poses (gravity's share taken off where that is nearer to the truth of
-    a flying body than of a held one), and its derivatives by the three twists, to first order."""
-    steps = np.diff(times_s)
-    spins = [turn_between(three[n + 1], three[n]) / steps[n] for n in (0, 1)]
-    centers = [p[:3, :3] @ motion.center_m + p[:3, 3] for p in three]
-    change = (centers[2] - centers[1]) / steps[1] - (centers[1] - centers[0]) / steps[0]
-    flight = motion.gravity_camera_m_s2 * 0.5 * (steps[0] + steps[1])
-    if np.linalg.norm(change - flight) < np.linalg.norm(change):
-        change = change - flight
-    residual = np.concatenate([spins[1] - spins[0], change])
-    jacobians = []
-    for pose, share in zip(three, (1 / steps[0], -1 / steps[0] - 1 / steps[1], 1 / steps[1])):
-        J = np.zeros((6, 6))
-        J[:3, 3:] = -share * pose[:3, :3]
-        J[3:, :3] = -share * pose[:3, :3]
-        J[3:, 3:] = share * pose[:3, :3] @ skew(motion.center_m)
-        jacobians.append(J)
+    poses: Float[Array, "m 3 4 4"], times_s: Float[Array, "m 3"], motion: Motion
+) -> tuple[Float[Array, "m 6"], Float[Array, "m 3 6 6"]]:
+    """Change of spin and of velocity over three poses each (gravity's share taken off where that is nearer to the truth
+    of a flying body than of a held one), and its derivatives by the three twists, to first order."""
+    steps = np.diff(times_s, axis=1)
+    spins = [turns_between(poses[:, n + 1], poses[:, n]) / steps[:, n, None] for n in (0, 1)]
+    centers = poses[:, :, :3, :3] @ motion.center_m + poses[:, :, :3, 3]
+    speeds = np.diff(centers, axis=1) / steps[:, :, None]
+    change = speeds[:, 1] - speeds[:, 0]
+    flight = change - motion.gravity_camera_m_s2 * 0.5 * steps.sum(axis=1, keepdims=True)
+    flies = np.linalg.norm(flight, axis=1) < np.linalg.norm(change, axis=1)
+    residual = np.concatenate([spins[1] - spins[0], np.where(flies[:, None], flight, change)], axis=1)
+    one, two = 1 / steps.T
+    turned = np.stack([one, -one - two, two], axis=1)[:, :, None, None] * poses[:, :, :3, :3]
+    jacobians = np.zeros((*poses.shape[:2], 6, 6))
+    jacobians[:, :, :3, 3:], jacobians[:, :, 3:, :3] = -turned, -turned
+    jacobians[:, :, 3:, 3:] = turned @ skew(motion.center_m)
     return residual, jacobians
 
 

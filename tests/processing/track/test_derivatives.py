@@ -345,14 +345,18 @@ def test_a_change_of_motion_has_the_derivatives_that_are_stated(gravity):
     poses = [se3.exponential(np.array([0.1 * n, 0.02, 0.6, 0.1 * n, 0.03 * n, 0.2])) for n in range(3)]
     poses = [p @ moved(1e-3 * rng.normal(size=6)) for p in poses]
     motion = Motion(times, np.zeros(3, int), np.array(gravity), np.array([0.01, -0.02, 0.015]), np.zeros(3, bool))
-    residual, jacobians = motion_residual(tuple(poses), times, motion)
+
+    def residual_of(three):
+        return motion_residual(np.stack(three)[None], times[None], motion)[0][0]
+
+    residual, jacobians = residual_of(poses), motion_residual(np.stack(poses)[None], times[None], motion)[1][0]
     for which in range(3):
         for axis, e in enumerate(np.eye(6)):
             ends = []
             for s in (1, -1):
                 other = list(poses)
                 other[which] = poses[which] @ se3.inverse(moved(s * 1e-5 * e))
-                ends.append(motion_residual(tuple(other), times, motion)[0])
+                ends.append(residual_of(other))
             slope = (ends[0] - ends[1]) / 2e-5
             # to first order: the spin's rotation vector is taken to change as the rotation does, right for small turns
             size = np.abs(jacobians[which]).max()
