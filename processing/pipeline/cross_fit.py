@@ -29,8 +29,8 @@ from recordings.errors import BadInput
 
 TURNS, GAIN = 6, 0.1
 """A further turn is for tosses whose misfit fell by more than this in the last one, and the second for those that the
-first left open, too: on shapes that it corrected. (Located anew they are once: of 13 sessions none took what a second
-search found, which cost a tenth to a fifth of all time.)"""
+first left open, too: on shapes that it corrected. (Located anew they are once: of eight sessions with such tosses none
+took what a second search found, which cost a tenth to a fifth of all time.)"""
 SURE_NATS = 0.5 * float(ndtri(0.95)) ** 2
 """What chance makes of a Gaussian once in twenty times (one side)."""
 SPOILED_NATS = SURE_NATS + float(np.log(7.0))
@@ -81,7 +81,8 @@ def refitted(
     run: Run, tracks: Mapping[int, Done], shape: Done, images: Mapping[int, Images],
     results: Mapping[int, TrackResult], locate: bool,
 ) -> dict[int, Done]:  # fmt: skip
-    """Tosses on the shape of others; `results`: how sure each one's track was."""
+    """Tosses on the shape of others, open ones located anew there where one may `locate` them; `results`: how sure each
+    one's track was."""
     return each(run, tracks, lambda t: chosen(run, tracks[t], results[t], shape, images[t], locate))
 
 
@@ -125,7 +126,7 @@ def worst_first(misfits: Mapping[int, float]) -> list[tuple[int, ...]]:
     return [tuple(int(t) for t in part) for part in np.array_split(order, min(FOLDS, len(order)))]
 
 
-def chosen(run: Run, before: Done, known: TrackResult, shape: Done, images: Images, locate: bool = True) -> Done:
+def chosen(run: Run, before: Done, known: TrackResult, shape: Done, images: Images, locate: bool) -> Done:
     """Of one toss: the track that it had (of which is `known` what it cost) or that refined on a shape, whichever fits
     itself better; or, where it is open and one may `locate` it, the object located anew on that, where its frames speak
     for this by more than chance: what they show together, what the shape shows of them, and what pairs of them have in

@@ -138,12 +138,9 @@ def choose_pairs(
     directions = view_directions(poses[index], center_m)
     cosine = np.clip(directions @ directions.T, -1, 1)
     chosen: set[tuple[int, int]] = set()
-    whose, stay, views = (
-        toss.tolist(),
-        np.cumsum(~still).tolist(),
-        index.tolist(),
-    )  # plain numbers: what follows is slow
-    far, wide = np.cos(np.radians(config.co_visible_deg)), np.cos(np.radians(config.wide_deg))
+    # plain numbers: arrays' own are slow to compare one by one
+    whose, stay, views = toss.tolist(), np.cumsum(~still).tolist(), index.tolist()
+    near, wide = np.cos(np.radians(config.co_visible_deg)), np.cos(np.radians(config.wide_deg))
     for a, i in enumerate(views):
         later = [j for j in views[a + 1 : a + 1 + config.neighbours] if whose[j] == whose[i]]
         taken = [i, *later]
@@ -152,7 +149,7 @@ def choose_pairs(
         for b in np.argsort(-cosine[a]).tolist():
             j = views[b]
             few = config.loops - wanted < config.least_loops
-            if wanted == 0 or cosine[a, b] < (wide if few else far):
+            if wanted == 0 or cosine[a, b] < (wide if few else near):
                 break
             if any(whose[j] == whose[t] and (abs(j - t) < config.spread_in_time or stay[j] == stay[t]) for t in taken):
                 continue

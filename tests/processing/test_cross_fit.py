@@ -248,7 +248,7 @@ def test_the_object_is_sought_anew_where_frames_are_not_sure(
     tosses = Tosses(tiny_world, tmp_path, 1)
     tried = Tried(monkeypatch, tmp_path, before=3.0, refined=2.0, anew=1.0)
     known = TrackResult(*frames)
-    found = cross_fit.chosen(tosses.run, tried.before, known, tried.shape, tosses.images[0])
+    found = cross_fit.chosen(tosses.run, tried.before, known, tried.shape, tosses.images[0], locate=True)
     assert found.key == ("anew" if sought else "refined")
     assert tried.asked == ["refined", *(["anew"] if sought else [])]
 
@@ -259,7 +259,7 @@ def test_another_way_of_lying_has_to_fit_better_beyond_chance(
 ) -> None:
     tosses = Tosses(tiny_world, tmp_path, 1)
     tried = Tried(monkeypatch, tmp_path, before=3.0, refined=2.0, anew=anew)
-    assert cross_fit.chosen(tosses.run, tried.before, OPEN, tried.shape, tosses.images[0]).key == taken
+    assert cross_fit.chosen(tosses.run, tried.before, OPEN, tried.shape, tosses.images[0], locate=True).key == taken
 
 
 @pytest.mark.parametrize(("cost", "taken"), [(0.05, "anew"), (0.15, "anew"), (0.2, "refined")])
@@ -269,7 +269,7 @@ def test_pairs_of_frames_may_contradict_what_the_surface_prefers(
     """A surface prefers the object anew by log(2) nats a frame."""
     tosses = Tosses(tiny_world, tmp_path, 1)
     tried = Tried(monkeypatch, tmp_path, cost, before=3.0, refined=2.0, anew=1.0)
-    assert cross_fit.chosen(tosses.run, tried.before, OPEN, tried.shape, tosses.images[0]).key == taken
+    assert cross_fit.chosen(tosses.run, tried.before, OPEN, tried.shape, tosses.images[0], locate=True).key == taken
 
 
 @pytest.mark.parametrize(("anew", "taken"), [((2.0, 0.01), "anew"), ((2.0, 0.03), "refined"), ((1.0, 0.02), "anew")])
@@ -283,7 +283,7 @@ def test_of_ways_that_fit_themselves_alike_the_others_shape_and_its_colors_tell(
     monkeypatch.setattr(
         cross_fit, "on_shape", lambda _, done, *__: seen(on_others[done.key][0], 10, on_others[done.key][1])
     )
-    assert cross_fit.chosen(tosses.run, tried.before, OPEN, tried.shape, tosses.images[0]).key == taken
+    assert cross_fit.chosen(tosses.run, tried.before, OPEN, tried.shape, tosses.images[0], locate=True).key == taken
 
 
 @pytest.mark.parametrize(("lost", "better"), [(0, True), (1, False)])
@@ -297,7 +297,7 @@ def test_a_track_that_the_shape_makes_worse_stays(
 ) -> None:
     tosses = Tosses(tiny_world, tmp_path, 1)
     tried = Tried(monkeypatch, tmp_path, before=2.0, refined=3.0)
-    assert cross_fit.chosen(tosses.run, tried.before, SURE, tried.shape, tosses.images[0]) is tried.before
+    assert cross_fit.chosen(tosses.run, tried.before, SURE, tried.shape, tosses.images[0], locate=True) is tried.before
 
 
 def test_a_shape_that_fits_nothing_locates_no_toss(

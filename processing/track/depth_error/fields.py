@@ -87,8 +87,9 @@ class DepthErrors:
         right[6 * count :] += np.einsum("cij,cj->ci", self._prior, self.relative).ravel()
         crossed = whole[6 * count :, : 6 * count]
         sides = np.concatenate([crossed, right[6 * count :, None]], 1)
-        self._root = cholesky(among, lower=True, overwrite_a=True, check_finite=False)
-        self._half = solve_triangular(self._root, sides, lower=True, check_finite=False)
+        # the errors are eliminated by half a solution each side: C' A^-1 C = (L^-1 C)' (L^-1 C), where A = L L'
+        self._root = cholesky(among, lower=True, overwrite_a=True)
+        self._half = solve_triangular(self._root, sides, lower=True)
         known = self._half[:, :-1].T @ self._half
         poses_only = whole[: 6 * count, : 6 * count] - known[:, :-1]
         H += poses_only.reshape(count, 6, count, 6).transpose(0, 2, 1, 3) / self._shared
@@ -98,7 +99,7 @@ class DepthErrors:
     def follow(self, twists: Float[Array, "f 6"]) -> None:
         """The errors that go with a step of the poses since the last `add`."""
         left = self._half[:, -1] + self._half[:, :-1] @ twists.ravel()
-        step = -solve_triangular(self._root, left, lower=True, trans="T", check_finite=False)
+        step = -solve_triangular(self._root, left, lower=True, trans="T")
         moved = self.relative + np.clip(step, -MOST_STEP, MOST_STEP).reshape(self.relative.shape)
         self.relative = np.clip(moved, -MOST_ERROR, MOST_ERROR)
 
