@@ -20,7 +20,7 @@ from multiprocessing.connection import Connection, wait
 from typing import Any
 
 TRACK, FLIGHT = "processing.track.kernels", "processing.track.flight_kernels"
-DEPTH_ERROR = "processing.track.depth_error.kernels"
+DEPTH_ERROR, FREE_SURFACE = "processing.track.depth_error.kernels", "processing.track.free_surface.kernels"
 CONSISTENCY, APPEARANCE = "processing.track.registration.consistency_kernels", "processing.track.appearance_ratio"
 STEPS, SOLVER = "processing.contact.physics.steps_cpu", "processing.contact.physics.solver_cpu"
 SE3 = "processing.motion.se3_kernels"
@@ -41,6 +41,8 @@ KERNELS: dict[tuple[str, str], list[tuple[str, ...]]] = {
     (TRACK, "to_object"): [(M, V, M, F8, M, V)],
     (DEPTH_ERROR, "add_pairs"): [(T, MI, F8, VI, VI, I8, M, M, F8, M4, M4, MI, V, V, V, M, V, M)],
     (DEPTH_ERROR, "add_shares"): [(M4, V, V, V, I8, V)],
+    (FREE_SURFACE, "surface_terms"): [(T, MI, M4, M4, MI, V, V, F8, F8, T, M, T, T, V)],
+    (FREE_SURFACE, "slide"): [(M, M, M4)],
     (FLIGHT, "fit_flights"): [(M, MI, V, V, M4, M4, MI, V, V, M, F8)],
     (PROFILE, "surface_terms"): [(M4, M, M, V, V, VB, VI, V, F8, F8, M, V, M, M, V)],
     (PROFILE, "outline_terms"): [(V4, VI, V, V, M, M, V, V, VB, VI, V, F8, M, V, M, M, V)],
@@ -68,7 +70,8 @@ KERNELS: dict[tuple[str, str], list[tuple[str, ...]]] = {
 """Kernels that Python calls, the slow ones to compile first, with the types that they are called with; what they call
 is compiled with them."""
 CALLS = {
-    TRACK: {SE3}, DEPTH_ERROR: {SE3}, FLIGHT: {TRACK}, CONSISTENCY: {SE3, TRACK}, APPEARANCE: {SE3}, STEPS: {SOLVER},
+    TRACK: {SE3}, DEPTH_ERROR: {SE3}, FREE_SURFACE: {SE3}, FLIGHT: {TRACK}, CONSISTENCY: {SE3, TRACK},
+    APPEARANCE: {SE3}, STEPS: {SOLVER},
 }  # fmt: skip
 """Whose kernels a module's kernels call."""
 

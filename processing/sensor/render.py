@@ -40,6 +40,12 @@ class RaycastRenderer:
     name = "raycast"
 
     def __init__(self, shape: ObjectShape, camera: CameraModel) -> None:
+        self._camera = camera
+        self._rays = camera.pixel_rays()
+        self.show(shape)
+
+    def show(self, shape: ObjectShape) -> None:
+        """Draws this shape from now on."""
         import open3d as o3d
 
         self._core: Any = o3d.core
@@ -48,8 +54,6 @@ class RaycastRenderer:
             o3d.core.Tensor(shape.vertices_m.astype(np.float32)), o3d.core.Tensor(shape.faces.astype(np.uint32))
         )
         self._outer_m = _hull_edges(shape.vertices_m)
-        self._camera = camera
-        self._rays = camera.pixel_rays()
 
     def depth(self, camera_from_object: Float[Array, "4 4"]) -> Float32[Array, "h w"]:
         out = np.zeros((self._camera.height, self._camera.width), dtype=np.float32)

@@ -23,7 +23,7 @@ from recordings.geometry import rotation_angle_rad
 from recordings.progress import Silent
 from recordings.results.folder import read_shape, read_track, write_track
 
-VERSION = 7
+VERSION = 8
 
 
 @dataclass(frozen=True)

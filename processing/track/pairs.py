@@ -72,9 +72,9 @@ class KnownFigures:
 
 
 def eliminated(
-    blocks: Float[Array, "m 6 6"], gradients: Float[Array, "m 6"], crossed: Float[Array, "m 6 s"],
+    blocks: Float[Array, "m d d"], gradients: Float[Array, "m d"], crossed: Float[Array, "m d s"],
     among: Float[Array, "m t s"],
-) -> tuple[Float[Array, "m 6 6"], Float[Array, "m 6"]]:  # fmt: skip
+) -> tuple[Float[Array, "m d d"], Float[Array, "m d"]]:  # fmt: skip
     """Normal equations of pairs of views (`kernels.graph_terms`) whatever the shading between the two is (Schur
     complement)."""
     own = among[:, :-1] + SHADING_SIGMA**-2.0 * np.eye(crossed.shape[2])

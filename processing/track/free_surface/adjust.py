@@ -1,7 +1,8 @@
 """Bundle adjustment of all tosses' poses with the surface free: what each toss's frames show of it is what all show.
 
-Toss by toss (block coordinate descent), the others' poses held, their views telling the surface's offsets: the work
-grows with the tosses, not with their square or cube.
+In turns: the surface is moved to where the views say that it is and drawn at every pose; on it the colours of pairs of
+views are compared, so that no view's colours lie on the errors of its own depth. Depth and outlines are compared with
+the surface itself. Toss by toss (block coordinate descent), the others' poses held.
 """
 
 from __future__ import annotations
@@ -10,20 +11,26 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from numpy import ndarray as Array
 from scipy.linalg import cho_factor, cho_solve
 
-from processing.sensor.noise import ADJUST_PAIRS_PER_MEASUREMENT
 from processing.track.beam import Scene
 from processing.track.depth_color_offset import put_at_color_times
 from processing.track.flags import per_view
+from processing.track.free_surface.appearance import AppearanceTerms
+from processing.track.free_surface.drawn import DrawnViews
 from processing.track.free_surface.surface import FreeSurface
 from processing.track.free_surface.terms import SurfaceMeasurements, SurfaceTerms
 from processing.track.hypotheses import HypothesisConfig, motion_of
-from processing.track.joint_refinement import refine
+from processing.track.joint_refinement import Motion, choose_pairs, refine
+from processing.track.pairs import compared
+from processing.track.schedule import rows
 from recordings.progress import Progress
 from recordings.tracks import ObjectShape
+
+APPEARANCE_SCALES = (0.16, 0.08, 0.04)
+"""Of appearance, turn by turn."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,31 +57,84 @@ def adjusted(
     """Tosses after they were refined with what all of them show of the shape's surface. Frames without a pose, or that
     show too little, stay as they are."""
     surface = FreeSurface(shape, tosses[0].scene.store.rectified.camera)
-    poses, used = [t.poses.copy() for t in tosses], [_used(t) for t in tosses]
+    used, after = [_used(t) for t in tosses], [_unchanged(t) for t in tosses]
     measured = [SurfaceMeasurements(surface, t.scene.store, config.depth_noise) for t in tosses]
-    said = [_said(*each) for each in zip(measured, poses, used)]
-    square, gradient = np.sum(said, axis=0)
-    offsets_m = -cho_solve(cho_factor(surface.prior + np.diag(square)), gradient)
-    for each, there, use in zip(measured, poses, used):
-        each.learn({int(i): each.of(int(i), there[i])[0] for i in np.flatnonzero(use)}, offsets_m)
-    said = [_said(*each) for each in zip(measured, poses, used)]
-    graph = replace(config.graph, schedule=config.finest, depth_errors=config.depth_noise,
-                    shared_noise=ADJUST_PAIRS_PER_MEASUREMENT)  # fmt: skip
-    after = []
-    for t, toss in enumerate(tosses):
-        spread, cost = np.full((len(poses[t]), 6, 6), np.nan), np.full(len(poses[t]), np.nan)
-        if used[t].any():
-            others = np.sum(said, axis=0) - said[t]
-            terms = SurfaceTerms(measured[t], np.flatnonzero(used[t]), others)
-            motion = motion_of(toss.scene, poses[t], used[t])
-            none = np.zeros(len(used[t]), dtype=bool)
-            joint = refine(toss.scene.store, poses[t], used[t], none, motion, graph, priors=(terms,))
-            poses[t], spread[used[t]] = joint.poses, joint.covariance[used[t]]
-            cost[used[t]] = per_view(joint.pairs, joint.figures, len(cost))[0][used[t]]
-            said[t] = _said(measured[t], poses[t], used[t])
-        after.append(AdjustedToss(poses[t], spread, cost))
-        progress.step(t + 1, len(tosses), "tosses")
+    drawn = DrawnViews([t.scene.store for t in tosses])
+    for turn, scale in enumerate(APPEARANCE_SCALES):
+        _follow(surface, measured, after, used)
+        for t, (toss, use) in enumerate(zip(after, used)):
+            drawn.draw(t, surface, toss.poses, use)
+        said = [_said(*each) for each in zip(measured, after, used)]
+        for t in range(len(tosses)):
+            if used[t].any():
+                free, others = np.flatnonzero(used[t]), np.sum(said, axis=0) - said[t]
+                terms = SurfaceTerms(measured[t], drawn.of_toss[t], free, others)
+                after[t] = _refined(t, tosses, after, used, drawn, terms, scale, config)
+                drawn.draw(t, surface, after[t].poses, used[t])
+                said[t] = _said(measured[t], after[t], used[t])
+            progress.step(turn * len(tosses) + t + 1, len(APPEARANCE_SCALES) * len(tosses), "tosses")
     return after
+
+
+def _unchanged(toss: PosedToss) -> AdjustedToss:
+    n = len(toss.poses)
+    return AdjustedToss(toss.poses.copy(), np.full((n, 6, 6), np.nan), np.full(n, np.nan))
+
+
+def _follow(
+    surface: FreeSurface, measured: Sequence[SurfaceMeasurements], tosses: Sequence[AdjustedToss],
+    used: Sequence[Bool[Array, " n"]],
+) -> None:  # fmt: skip
+    """Moves the surface to where the views at their poses say that it is."""
+    for _ in range(2):  # how far outlines err is told by what the surface leaves of them, and weighs them for it
+        square, gradient = np.sum([_said(*each) for each in zip(measured, tosses, used)], axis=0)
+        offsets_m = -cho_solve(cho_factor(surface.prior + np.diag(square)), gradient + surface.pull)
+        for each, toss, use in zip(measured, tosses, used):
+            each.learn({int(i): each.of(int(i), toss.poses[i])[0] for i in np.flatnonzero(use)}, offsets_m)
+    surface.move(offsets_m)
+    for each in measured:
+        each.redraw()
+
+
+def _refined(
+    t: int, tosses: Sequence[PosedToss], now: Sequence[AdjustedToss], used: Sequence[Bool[Array, " n"]],
+    drawn: DrawnViews, terms: SurfaceTerms, scale: float, config: HypothesisConfig,
+) -> AdjustedToss:  # fmt: skip
+    """Toss `t`, its views' colours compared with all tosses' at this scale."""
+    poses, use, views = np.concatenate([toss.poses for toss in now]), np.concatenate(used), drawn.of_toss[t]
+    fixed = np.ones(len(use), dtype=bool)
+    fixed[views] = False
+    motion = _together([motion_of(*each) for each in zip([x.scene for x in tosses], [x.poses for x in now], used)], t)
+    pairs = choose_pairs(poses, use, motion.toss, motion.center_m, motion.still, config.graph)
+    pairs = pairs[~fixed[pairs].all(axis=1) & np.isfinite(drawn.at[pairs]).all(axis=(1, 2, 3))]
+    colors = AppearanceTerms(drawn, pairs, scale)
+    graph = replace(config.graph, schedule=config.finest, neighbours=0, loops=0)
+    joint = refine(drawn.store, poses, use, fixed, motion, graph, priors=(terms, colors))
+    poses, spread = joint.poses[views], np.full((len(used[t]), 6, 6), np.nan)
+    spread[used[t]] = joint.covariance[views][used[t]]
+    own = pairs[~fixed[pairs].any(axis=1)] - views.start
+    return AdjustedToss(poses, spread, _costs(tosses[t].scene, poses, used[t], own, config))
+
+
+def _together(each: Sequence[Motion], t: int) -> Motion:
+    """The motion of all tosses' views, of which those of toss `t` are free."""
+    lengths = [len(m.times_s) for m in each]
+    first = sum(lengths[:t])
+    return replace(
+        each[t], times_s=np.concatenate([m.times_s for m in each]), toss=np.repeat(np.arange(len(each)), lengths),
+        still=np.concatenate([m.still for m in each]),
+        carried={(first + a, first + b): moved for (a, b), moved in each[t].carried.items()},
+    )  # fmt: skip
+
+
+def _costs(
+    scene: Scene, poses: Float[Array, "n 4 4"], use: Bool[Array, " n"], pairs: Int[Array, "m 2"],
+    config: HypothesisConfig,
+) -> Float[Array, " n"]:  # fmt: skip
+    """How badly each view, with the depth that it saw, fits those that it was compared with."""
+    (row,) = rows(config.finest, float(np.median(np.linalg.norm(scene.store.center_m[use], axis=1))))
+    figures = compared(scene.store, poses, pairs, row, shaded=False)[2]
+    return np.where(use, per_view(pairs, figures, len(use))[0], np.nan)
 
 
 def _used(toss: PosedToss) -> Bool[Array, " n"]:
@@ -84,12 +144,10 @@ def _used(toss: PosedToss) -> Bool[Array, " n"]:
     return use & put_at_color_times(scene, toss.poses, use)
 
 
-def _said(
-    measured: SurfaceMeasurements, poses: Float[Array, "n 4 4"], use: Bool[Array, " n"]
-) -> Float[Array, "2 k"]:  # fmt: skip
+def _said(measured: SurfaceMeasurements, toss: AdjustedToss, use: Bool[Array, " n"]) -> Float[Array, "2 k"]:
     """What a toss's views at their poses say of the offsets (`Residuals.of_offsets`)."""
     said = np.zeros((2, measured.surface.count))
     for i in np.flatnonzero(use):
-        for residuals in measured.of(int(i), poses[i]):
+        for residuals in measured.of(int(i), toss.poses[i]):
             said += residuals.of_offsets(len(said[0]))
     return said

@@ -1,10 +1,16 @@
-"""A shape whose surface is unknown along its normals: an offset for each small patch of it, smooth over the patches."""
+"""A shape whose surface is unknown along its normals: an offset for each small patch of it, smooth over the patches.
+
+The surface moves: once its offsets are told they bend it, and it is drawn as it now is.
+"""
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Float32, Int
 from numpy import ndarray as Array
 from scipy.spatial import cKDTree
 
@@ -21,24 +27,58 @@ SMOOTH_SIGMA_M = 0.0007
 """... and by how much neighbouring patches of one face differ in it; .0003 gives the same poses."""
 MOST_POINTS = 200
 """Of an outline, evenly along it."""
+EVEN = 2
+"""Times that offsets and normals of vertices are averaged with their neighbours': patches leave no steps."""
 
 
 class FreeSurface:
     """The patches of a shape (object frame), and what is known of their `count` offsets before anything is measured:
-    `prior`, an inverse covariance (1/m^2)."""
+    `prior`, an inverse covariance (1/m^2). `moved_m`: how far each has been moved."""
 
     def __init__(self, shape: ObjectShape, pinhole: CameraModel) -> None:
         """`pinhole`: the camera, rectified."""
-        self._shape, self._renderer = shape, RaycastRenderer(shape, pinhole)
-        self.vertices_m, self.normals = shape.vertices_m, _vertex_normals(shape)
+        self._first, self._renderer, self._neighbours = shape, RaycastRenderer(shape, pinhole), _neighbours(shape)
+        self._seen = np.ones(len(shape.faces), bool) if shape.observed is None else shape.observed[shape.faces].all(1)
+        self._put(shape)
         size_m = float(np.linalg.norm(np.ptp(shape.vertices_m, axis=0)))
-        self.patch = _patches(shape.vertices_m, self.normals, max(PATCH_M, size_m / PATCHES_ACROSS))
+        self.width_m = max(PATCH_M, size_m / PATCHES_ACROSS)
+        """Of a patch."""
+        self.patch = _patches(shape.vertices_m, self.normals, self.width_m)
         """Of each vertex."""
         self.count = int(self.patch.max()) + 1
         mean = np.stack([np.bincount(self.patch, axis, self.count) for axis in self.normals.T], -1)
         self.patch_normals = mean / np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-9)
-        self.prior = _smooth(shape.faces, self.patch, self.patch_normals) + np.eye(self.count) / OFFSET_SIGMA_M**2
+        alone = np.eye(self.count) - (1 - 1 / self.count) / self.count  # of their mean no more than of any one
+        self.prior = _smooth(shape.faces, self.patch, self.patch_normals) + alone / OFFSET_SIGMA_M**2
+        self.moved_m = np.zeros(self.count)
+        ways = self._even(self.normals)
+        self._ways = ways / np.maximum(np.linalg.norm(ways, axis=1, keepdims=True), 1e-9)
+
+    @property
+    def pull(self) -> Float[Array, " k"]:
+        """The prior's gradient by further offsets: back to the surface as it was."""
+        return np.asarray(self.prior @ self.moved_m)
+
+    def move(self, offsets_m: Float[Array, " k"]) -> None:
+        """Moves every patch on by its offset."""
+        self.moved_m = self.moved_m + offsets_m
+        moved = self._first.vertices_m + self._even(self.moved_m[self.patch, None]) * self._ways
+        self._put(replace(self._first, vertices_m=moved))
+
+    def depth(self, camera_from_object: Float[Array, "4 4"]) -> Float32[Array, "h w"]:
+        """Depth (m) of the surface at a pose; 0 beside it, and where no view saw it."""
+        depth_m, face, _ = self._renderer.hits(camera_from_object)
+        return np.where(self._seen[face], depth_m, np.float32(0))
+
+    def _put(self, shape: ObjectShape) -> None:
+        self._renderer.show(shape)
+        self.vertices_m, self.normals = shape.vertices_m, _vertex_normals(shape)
         self._tree = cKDTree(shape.vertices_m)
+
+    def _even(self, values: Float[Array, "v d"]) -> Float[Array, "v d"]:
+        for _ in range(EVEN):
+            values = self._neighbours @ values
+        return values
 
     def nearest(self, points_m: Float[Array, "n 3"]) -> tuple[Float[Array, " n"], Int[Array, " n"]]:
         """Distance (m) to the nearest vertex, and which it is."""
@@ -50,12 +90,11 @@ class FreeSurface:
         nearest vertex, and how many pixels of the outline a point stands for. Parts that no view saw are left out."""
         depth_m, face, within = self._renderer.hits(camera_from_object)
         v, u = _border(depth_m > 0)
-        if self._shape.observed is not None:
-            seen = self._shape.observed[self._shape.faces[face[v, u]]].all(-1)
-            v, u = v[seen], u[seen]
+        seen = self._seen[face[v, u]]
+        v, u = v[seen], u[seen]
         some = np.unique(np.linspace(0, len(v) - 1, MOST_POINTS).astype(int)) if len(v) else np.zeros(0, dtype=int)
         share, v, u = len(v) / max(len(some), 1), v[some], u[some]
-        corners = self._shape.faces[face[v, u]]
+        corners = self._first.faces[face[v, u]]
         points = np.einsum("nc,ncj->nj", within[v, u].astype(np.float64), self.vertices_m[corners])
         return points, corners[:, 0], share
 
@@ -78,6 +117,18 @@ def _vertex_normals(shape: ObjectShape) -> Float[Array, "v 3"]:
 
     mesh = trimesh.Trimesh(shape.vertices_m, shape.faces, process=False)
     return np.array(mesh.vertex_normals, dtype=np.float64)
+
+
+def _neighbours(shape: ObjectShape) -> Any:
+    """Matrix (sparse, v x v) of the mean over a vertex and those that share an edge with it."""
+    from scipy.sparse import coo_array, diags_array, eye_array
+
+    count = len(shape.vertices_m)
+    a, b = shape.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).T
+    touch = coo_array((np.ones(2 * len(a)), (np.r_[a, b], np.r_[b, a])), shape=(count, count)).tocsr()
+    touch.data[:] = 1.0  # an edge belongs to two faces
+    touch = touch + eye_array(count)
+    return diags_array(1.0 / touch.sum(axis=1)) @ touch
 
 
 def _patches(vertices_m: Float[Array, "v 3"], normals: Float[Array, "v 3"], width_m: float) -> Int[Array, " v"]:

@@ -27,10 +27,10 @@ from processing.track.free_surface.surface import FreeSurface
 from recordings.estimation.robust import geman_mcclure_weight
 from recordings.geometry import CameraModel
 
-OUTLINE_PX_PER_MEASUREMENT = 4.0
-"""So many pixels along a mask's outline err as one. The correlation of its errors at the true poses of four tosses
-(choose-003, the former judge-021) is .76 to .85 two pixels apart, .5 to .6 five, .05 to .4 ten, none at twenty. With 8,
-4 and 2 these tosses' poses, 13.4, 3.5, 4.8 and 9.1 degrees off before, are off by 4.36, 4.19 and 4.17 in the mean."""
+OUTLINE_PX_PER_MEASUREMENT = 12.0
+"""So many pixels along a mask's outline err as one: of its errors at the true poses of four tosses (choose-003, the
+former judge-021) the correlation is .76 to .85 two pixels apart, .5 to .6 five, .05 to .4 ten, none at twenty, which
+makes 11 to 17 pixels."""
 FIRST_SIGMA_PX, LEAST_SIGMA_PX = 2.0, 0.4
 """Standard deviation of an outline's errors before the residuals of all views have told it (1 px at the true poses of
 these tosses), and the least: pixels are whole."""
@@ -83,6 +83,10 @@ class SurfaceMeasurements:
     def of(self, view: int, pose: Float[Array, "4 4"]) -> tuple[Residuals, Residuals]:
         """Residuals of a view's outline and of its depth at a pose (camera_from_object)."""
         return self._of_outline(view, pose), self._of_depth(view, pose)
+
+    def redraw(self) -> None:
+        """Outlines are drawn anew: the surface has moved."""
+        self._outlines.clear()
 
     def learn(self, outlines: Mapping[int, Residuals], offsets_m: Float[Array, " k"]) -> None:
         """How far outlines err, by view and at all, from what their residuals leave at these offsets."""
@@ -167,17 +171,19 @@ LEAST_SIGMA_M = 1e-4
 
 
 class SurfaceTerms:
-    """The `free` views of a toss, and what other tosses' views say of the offsets (`others`; `Residuals.of_offsets`),
-    as a term of the joint refinement (`joint_refinement.Terms`)."""
+    """The `free` views of a toss, which are `views` of the refinement's, and what other tosses' views say of the
+    offsets (`others`; `Residuals.of_offsets`), as a term of the joint refinement (`joint_refinement.Terms`)."""
 
-    def __init__(self, measured: SurfaceMeasurements, free: Int[Array, " m"], others: Float[Array, "2 k"]) -> None:
-        self._measured, self._free, self._others = measured, [int(i) for i in free], others
+    def __init__(
+        self, measured: SurfaceMeasurements, views: slice, free: Int[Array, " m"], others: Float[Array, "2 k"]
+    ) -> None:
+        self._measured, self._views, self._free, self._others = measured, views, [int(i) for i in free], others
 
     def add(
         self, H: Float[Array, "f f 6 6"], g: Float[Array, "f 6"], poses: Float[Array, "n 4 4"], place: Int[Array, " n"]
     ) -> None:
         """Adds the views' normal equations, the surface's offsets eliminated."""
-        count = self._measured.surface.count
+        count, poses, place = self._measured.surface.count, poses[self._views], place[self._views]
         said = self._others
         couplings, free, outlines = [], [], dict[int, Residuals]()
         for i in self._free:
@@ -194,8 +200,9 @@ class SurfaceTerms:
             if place[i] >= 0:
                 couplings.append(coupling)
                 free.append(int(place[i]))
-        factor = cho_factor(self._measured.surface.prior + np.diag(said[0]), lower=True)
-        offsets_m = -cho_solve(factor, said[1])
+        surface = self._measured.surface
+        factor = cho_factor(surface.prior + np.diag(said[0]), lower=True)
+        offsets_m = -cho_solve(factor, said[1] + surface.pull)
         self._measured.learn(outlines, offsets_m)
         if free:
             C, places = np.concatenate(couplings), np.array(free)

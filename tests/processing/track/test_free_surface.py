@@ -10,12 +10,16 @@ from scipy.spatial.transform import Rotation
 
 from processing.features.sift import Sift
 from processing.motion import se3_kernels as se3
+from processing.sensor import view_layout as lay
 from processing.sensor.noise import TRACK_COVARIANCE_SCALE, DepthNoise
 from processing.sensor.render import RaycastRenderer
 from processing.sensor.view import Crop
 from processing.track.beam import Scene
 from processing.track.free_surface.adjust import PosedToss, adjusted
-from processing.track.free_surface.surface import FreeSurface
+from processing.track.free_surface.appearance import AppearanceTerms
+from processing.track.free_surface.drawn import DrawnViews
+from processing.track.free_surface.kernels import slide
+from processing.track.free_surface.surface import OFFSET_SIGMA_M, FreeSurface
 from processing.track.free_surface.terms import (
     LEAST_SIGMA_PX,
     SurfaceMeasurements,
@@ -59,13 +63,20 @@ def true_poses(seed: int) -> np.ndarray:
     return poses
 
 
-def seen(poses: np.ndarray) -> Scene:
-    """Views of the ellipsoid at the poses, without any texture."""
-    drawn = [RaycastRenderer(ellipsoid(), CAMERA).depth(pose) for pose in poses]
-    grey = np.full((CAMERA.height, CAMERA.width, 3), 128, np.uint8)
-    frames = [RgbdFrame("d455", i, i * 33_333_333, i * 33_333_333, grey, depth) for i, depth in enumerate(drawn)]
-    store, times_ns, _ = views_of(frames, [d > 0 for d in drawn], CAMERA, np.ones(len(poses)), TrackConfig(), None,
-                                  Silent())  # fmt: skip
+def seen(poses: np.ndarray, printed: bool = False, bent_m: float = 0.0) -> Scene:
+    """Views of the ellipsoid at the poses, without any texture or `printed`, each one's depth bent by so much."""
+    renderer, random, frames = RaycastRenderer(ellipsoid(), CAMERA), np.random.default_rng(3), []
+    v, u = np.indices((CAMERA.height, CAMERA.width))
+    for i, pose in enumerate(poses):
+        depth_m, face, weight = renderer.hits(pose)
+        points = np.einsum("hwc,hwcj->hwj", weight, ellipsoid().vertices_m[ellipsoid().faces[face]])
+        waves = np.sin(points @ [[200, 0, 90], [0, 300, 60], [90, 40, 250]]) if printed else np.zeros(points.shape)
+        color = np.where(depth_m[..., None] > 0, 128 + 60 * waves, 90).astype(np.uint8)
+        bend = bent_m * np.sin(u / 20 + random.uniform(0, 6)) * np.sin(v / 20 + random.uniform(0, 6))
+        depth_m = np.where(depth_m > 0, depth_m + bend, 0).astype(np.float32)
+        frames.append(RgbdFrame("d455", i, i * 33_333_333, i * 33_333_333, color, depth_m))
+    store, times_ns, _ = views_of(frames, [f.depth_m > 0 for f in frames], CAMERA, np.ones(len(poses)), TrackConfig(),
+                                  None, Silent())  # fmt: skip
     return Scene(store, 1e-9 * times_ns, np.zeros(3), np.zeros(3), Sift())
 
 
@@ -78,6 +89,12 @@ def apart_deg(found: np.ndarray, true: np.ndarray) -> np.ndarray:
 @pytest.fixture(scope="module")
 def tosses() -> list[Scene]:
     return [seen(true_poses(seed)) for seed in (1, 2)]
+
+
+@pytest.fixture(scope="module")
+def printed() -> list[Scene]:
+    """The body printed, the depth of each view bent by 8 mm."""
+    return [seen(true_poses(seed), printed=True, bent_m=0.008) for seed in (1, 2)]
 
 
 def measured_by(scene: Scene, smaller_m: float) -> SurfaceMeasurements:
@@ -120,6 +137,26 @@ def test_residuals_change_as_their_derivatives_say(tosses, which):
         assert np.median(error) < 0.01 * np.abs(before.by_twist[used, a]).max()
 
 
+@pytest.mark.parametrize("grown_m", [0.002, -0.002])
+def test_a_surface_that_moved_is_drawn_where_it_is_and_held_by_what_was_known(grown_m):
+    surface, pose = FreeSurface(ellipsoid(), CAMERA), true_poses(1)[4]
+    before = surface.depth(pose)
+    surface.move(np.full(surface.count, 0.5 * grown_m))
+    surface.move(np.full(surface.count, 0.5 * grown_m))
+    moved = np.einsum("vj,vj->v", surface.vertices_m - ellipsoid().vertices_m, FreeSurface(ellipsoid(), CAMERA).normals)
+    np.testing.assert_allclose(moved, grown_m, rtol=0.05)
+    middle = before[np.nonzero(before)].min() == before
+    assert (before - surface.depth(pose))[middle].max() == pytest.approx(grown_m, rel=0.1)
+    assert surface.pull @ surface.moved_m == pytest.approx((grown_m / OFFSET_SIGMA_M) ** 2)  # as likely as one patch's
+
+
+def test_what_no_view_saw_of_a_surface_has_no_depth():
+    half = replace(ellipsoid(), observed=ellipsoid().vertices_m[:, 0] > 0)
+    depth_m, whole_m = (FreeSurface(s, CAMERA).depth(true_poses(1)[4]) for s in (half, ellipsoid()))
+    assert 0 < (depth_m > 0).sum() < (whole_m > 0).sum()
+    np.testing.assert_array_equal(depth_m[depth_m > 0], whole_m[depth_m > 0])
+
+
 def test_an_outline_moves_with_its_surface(tosses):
     pose = true_poses(1)[4]
     thin, thick = (measured_by(tosses[0], s).of(4, pose)[0] for s in (0.001, 0.0))
@@ -134,7 +171,7 @@ def test_terms_know_no_turn_that_the_surface_can_follow(tosses):
     held = []
     for others in (np.zeros((2, count)), np.stack([np.full(count, 1e12), np.zeros(count)])):
         H, g = np.zeros((1, 1, 6, 6)), np.zeros((1, 6))
-        SurfaceTerms(measured, np.array([4]), others).add(H, g, poses, place)
+        SurfaceTerms(measured, slice(COUNT), np.array([4]), others).add(H, g, poses, place)
         held.append(np.linalg.eigvalsh(H[0, 0]))
     assert (held[0] > -1e-6 * held[1].max()).all()
     assert (held[0] < 0.5 * held[1]).all()
@@ -158,6 +195,59 @@ def test_poses_that_drift_come_to_one_surface(tosses, smaller_m, left):
         claimed_deg = np.degrees(np.sqrt(variance))
         assert np.sqrt(np.mean((apart_deg(end.poses, true_poses(seed)) / claimed_deg) ** 2)) < 1.0
         assert claimed_deg.max() < 6.0  # and the claim says something: of a body without texture
+
+
+def test_print_is_compared_on_the_surface_that_all_show_not_on_each_views_own_depth(printed):
+    """Poses that drift by 8 degrees come back although each view's depth bends by 8 mm, and the shape is too small."""
+    random, config = np.random.default_rng(0), HypothesisConfig(depth_noise=DepthNoise(0.011, 1000.0))
+    posed = []
+    for seed, scene in zip((1, 2), printed):
+        poses, drift = true_poses(seed), random.normal(size=3)
+        for i, pose in enumerate(poses):
+            pose[:3, :3] = pose[:3, :3] @ rotation_exp(np.radians(8.0) * i / COUNT * drift / np.linalg.norm(drift))
+        posed.append(PosedToss(scene, poses))
+    for seed, toss, end in zip((1, 2), posed, adjusted(posed, ellipsoid(0.002), config, Silent())):
+        assert apart_deg(toss.poses, true_poses(seed)).mean() == pytest.approx(2.0)
+        assert apart_deg(end.poses, true_poses(seed)).mean() < 0.6
+
+
+@pytest.mark.parametrize("its_own", [True, False], ids=["its points in others", "theirs in its image"])
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_print_tells_how_far_one_view_is_turned(printed, its_own, axis):
+    """About the body's middle, which a turn leaves where it is; others are where they should be."""
+    poses, turn = true_poses(1), np.zeros(3)
+    turn[axis] = np.radians(1.5)
+    drawn = DrawnViews([printed[0].store])
+    poses[4, :3, :3] = poses[4, :3, :3] @ rotation_exp(turn)
+    drawn.draw(0, FreeSurface(ellipsoid(), CAMERA), poses, np.ones(COUNT, dtype=bool))
+    ends = [4] * 4, [2, 3, 5, 6]
+    terms = AppearanceTerms(drawn, np.stack(ends if its_own else ends[::-1], -1), 0.3)
+    H, g = np.zeros((1, 1, 6, 6)), np.zeros((1, 6))
+    terms.add(H, g, poses, np.where(np.arange(COUNT) == 4, 0, -1))
+    step = -np.linalg.solve(H[0, 0, 3:, 3:], g[0, 3:])
+    np.testing.assert_allclose(step, turn, atol=np.radians(0.3))  # object_from_camera turns by as much
+
+
+def test_what_a_view_shows_stays_on_the_surface_when_the_view_moves(printed):
+    store, pose, surface = printed[0].store, true_poses(1)[4], FreeSurface(ellipsoid(), CAMERA)
+    drawn = DrawnViews([store])
+    drawn.draw(0, surface, true_poses(1), np.arange(COUNT) == 4)
+    first, count = drawn.store.table[4, lay.FIRST], drawn.store.table[4, lay.COUNT]
+    before = drawn.store.samples[first : first + count].copy()
+    after = before.copy()
+    now = pose @ se3.exponential(np.array([0.001, -0.001, 0.002, 0.02, 0.01, -0.01]))
+    slide(pose, now, after)
+    np.testing.assert_allclose(after[:, :2] / after[:, 2:3], before[:, :2] / before[:, 2:3], atol=1e-6)
+
+    def beside_m(samples: np.ndarray, at: np.ndarray) -> np.ndarray:
+        points = (samples[:, :3].astype(float) - at[:3, 3]) @ at[:3, :3]
+        vertex = surface.nearest(points)[1]
+        return np.abs(np.einsum("nj,nj->n", surface.normals[vertex], points - surface.vertices_m[vertex]))
+
+    facing = np.einsum("nj,nj->n", before[:, :3], before[:, 3:6]) / np.linalg.norm(before[:, :3], axis=1) < -0.4
+    drawn_m = beside_m(before[facing], pose).mean()  # drawn depth is smoothed over windows
+    assert beside_m(before[facing], now).mean() > 3 * drawn_m
+    assert beside_m(after[facing], now).mean() < 1.2 * drawn_m
 
 
 def test_frames_without_a_pose_stay_so(tosses):
