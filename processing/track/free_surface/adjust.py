@@ -30,7 +30,7 @@ from recordings.progress import Progress
 from recordings.tracks import ObjectShape
 
 APPEARANCE_SCALES = (0.16, 0.08, 0.04)
-"""Of appearance, turn by turn."""
+"""Of differences of colour, turn by turn. Without the first a toss of choose-034 stays 4.5 degrees off for 3.7."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -41,9 +41,7 @@ class FreeSurface:
         self._seen = np.ones(len(shape.faces), bool) if shape.observed is None else shape.observed[shape.faces].all(1)
         self._put(shape)
         size_m = float(np.linalg.norm(np.ptp(shape.vertices_m, axis=0)))
-        self.width_m = max(PATCH_M, size_m / PATCHES_ACROSS)
-        """Of a patch."""
-        self.patch = _patches(shape.vertices_m, self.normals, self.width_m)
+        self.patch = _patches(shape.vertices_m, self.normals, max(PATCH_M, size_m / PATCHES_ACROSS))
         """Of each vertex."""
         self.count = int(self.patch.max()) + 1
         mean = np.stack([np.bincount(self.patch, axis, self.count) for axis in self.normals.T], -1)
