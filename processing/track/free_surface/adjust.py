@@ -70,8 +70,9 @@ def adjusted(
                 free, others = np.flatnonzero(used[t]), np.sum(said, axis=0) - said[t]
                 terms = SurfaceTerms(measured[t], drawn.of_toss[t], free, others)
                 after[t] = _refined(t, tosses, after, used, drawn, terms, scale, config)
-                drawn.draw(t, surface, after[t].poses, used[t])
-                said[t] = _said(measured[t], after[t], used[t])
+                if t + 1 < len(tosses):  # for the others of this turn; before the next all are drawn
+                    drawn.draw(t, surface, after[t].poses, used[t])
+                    said[t] = _said(measured[t], after[t], used[t])
             progress.step(turn * len(tosses) + t + 1, len(APPEARANCE_SCALES) * len(tosses), "tosses")
     return after
 

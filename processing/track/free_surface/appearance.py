@@ -17,8 +17,9 @@ from processing.track.pairs import PART, eliminated
 REACH_M = 0.01
 """A point farther than this from the surface that the other view shows is hidden from it."""
 SURE_COST = 0.16
-"""A pair that costs more counts less. Of .08, .16 and .27 the smaller are better for small bodies whose colours are
-noise, the larger for print: 2.58, 2.58 and 2.64 degrees in the mean (ten tosses)."""
+"""A pair that costs more counts less. Of .08, .16 and .27 none is the best: eight tosses (choose-003, 008, 034, the
+former judge-004) are off by 2.8, 2.9 and 2.8 degrees in the mean, small bodies whose colours are noise by less with
+little, printed ones by less with much."""
 
 
 class AppearanceTerms:
