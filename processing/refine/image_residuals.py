@@ -227,7 +227,7 @@ class ShapeDrawer:
     """Depth, colours and normals of a shape at a pose, through the lens as it is."""
 
     def __init__(self, shape: ObjectShape, camera: CameraModel) -> None:
-        self._renderer = RaycastRenderer(shape, camera)
+        self._renderer, self._camera = RaycastRenderer(shape, camera), camera
         self._rgb = None if shape.vertex_rgb is None else shape.vertex_rgb.astype(np.float32)
         self._faces = shape.faces
         a, b, c = np.moveaxis(shape.vertices_m[shape.faces], 1, 0)
@@ -236,14 +236,15 @@ class ShapeDrawer:
 
     def draw(self, camera_from_object: Float[Array, "4 4"]) -> Drawn:
         """The shape at a pose."""
-        depth_m, face, weight = self._renderer.hits(camera_from_object)
-        seen = depth_m > 0
-        met = face[seen]
-        normal = np.zeros((*depth_m.shape, 3), dtype=np.float32)
-        normal[seen] = self._normals[met]
+        hits, size = self._renderer.hits(camera_from_object), (self._camera.height, self._camera.width)
+        seen = hits.depth_m > 0
+        met = hits.face[seen]
+        depth_m, normal = np.zeros(size, dtype=np.float32), np.zeros((*size, 3), dtype=np.float32)
+        depth_m[hits.box] = hits.depth_m
+        normal[hits.box][seen] = self._normals[met]
         if self._rgb is None:
             return Drawn(depth_m, None, normal)
-        rgb = np.zeros((*depth_m.shape, 3), dtype=np.uint8)
+        rgb = np.zeros((*size, 3), dtype=np.uint8)
         corners = self._rgb[self._faces[met]]
-        rgb[seen] = np.clip((corners * weight[seen][..., None]).sum(1), 0, 255).astype(np.uint8)
+        rgb[hits.box][seen] = np.clip((corners * hits.weight[seen][..., None]).sum(1), 0, 255).astype(np.uint8)
         return Drawn(depth_m, rgb, normal)

@@ -34,6 +34,17 @@ class Renderer(Protocol):
         ...
 
 
+@dataclass(frozen=True, eq=False)
+class Hits:
+    """A `box` of the image (rows, columns) in which the shape lies: depth (m; 0: no ray meets it), the face that each
+    ray meets, and where on it (barycentric weights of its corners)."""
+
+    box: tuple[slice, slice]
+    depth_m: Float32[Array, "h w"]
+    face: UInt32[Array, "h w"]
+    weight: Float32[Array, "h w 3"]
+
+
 class RaycastRenderer:
     """One ray through the centre of every pixel, against the triangles themselves."""
 
@@ -53,31 +64,21 @@ class RaycastRenderer:
         self._scene.add_triangles(
             o3d.core.Tensor(shape.vertices_m.astype(np.float32)), o3d.core.Tensor(shape.faces.astype(np.uint32))
         )
-        self._outer_m = _hull_edges(shape.vertices_m)
+        self._outer_m = _outermost(shape.vertices_m, bent=self._camera.distortion_model != "none")
 
     def depth(self, camera_from_object: Float[Array, "4 4"]) -> Float32[Array, "h w"]:
         out = np.zeros((self._camera.height, self._camera.width), dtype=np.float32)
         box = self._box(camera_from_object)
-        if box is not None:
-            out[box] = _met(self._cast(camera_from_object, box))
+        out[box] = _met(self._cast(camera_from_object, box))
         return out
 
-    def hits(
-        self, camera_from_object: Float[Array, "4 4"]
-    ) -> tuple[Float32[Array, "h w"], UInt32[Array, "h w"], Float32[Array, "h w 3"]]:
-        """Depth, the face that each ray meets, and where on it (barycentric weights of its corners)."""
-        size = (self._camera.height, self._camera.width)
-        out, face = np.zeros(size, dtype=np.float32), np.zeros(size, dtype=np.uint32)
-        weight = np.zeros((*size, 3), dtype=np.float32)
+    def hits(self, camera_from_object: Float[Array, "4 4"]) -> Hits:
+        """What the rays meet where the shape may be in the image."""
         box = self._box(camera_from_object)
-        if box is None:
-            return out, face, weight
         found = self._cast(camera_from_object, box)
-        out[box] = _met(found)
-        face[box] = np.where(out[box] > 0, found["primitive_ids"].numpy(), 0)
-        uv = found["primitive_uvs"].numpy()
-        weight[box] = np.concatenate([1 - uv.sum(-1, keepdims=True), uv], -1)
-        return out, face, weight
+        depth_m, uv = _met(found), found["primitive_uvs"].numpy()
+        face = np.where(depth_m > 0, found["primitive_ids"].numpy(), 0)
+        return Hits(box, depth_m, face, np.concatenate([1 - uv.sum(-1, keepdims=True), uv], -1))
 
     def _cast(self, camera_from_object: Float[Array, "4 4"], box: tuple[slice, slice]) -> Any:
         object_from_camera = np.linalg.inv(camera_from_object)
@@ -86,12 +87,13 @@ class RaycastRenderer:
         rays[..., :3], rays[..., 3:] = object_from_camera[:3, 3], along
         return self._scene.cast_rays(self._core.Tensor(rays))
 
-    def _box(self, camera_from_object: Float[Array, "4 4"]) -> tuple[slice, slice] | None:
-        """The part of the image that the shape can touch; all of it when a vertex is near or behind the camera."""
+    def _box(self, camera_from_object: Float[Array, "4 4"]) -> tuple[slice, slice]:
+        """The part of the image that the shape can touch, and two pixels around it; all of it when a vertex is near or
+        behind the camera."""
         points = self._outer_m @ camera_from_object[:3, :3].T + camera_from_object[:3, 3]
-        whole = (slice(0, self._camera.height), slice(0, self._camera.width))
+        whole, none = (slice(0, self._camera.height), slice(0, self._camera.width)), (slice(0, 0), slice(0, 0))
         if points[:, 2].max() <= 0:
-            return None
+            return none
         pixels = self._camera.project(points)
         if not np.isfinite(pixels).all():
             return whole
@@ -99,7 +101,7 @@ class RaycastRenderer:
         high = np.ceil(pixels.max(0)).astype(int) + 3
         rows = slice(max(low[1], 0), min(high[1], self._camera.height))
         columns = slice(max(low[0], 0), min(high[0], self._camera.width))
-        return (rows, columns) if rows.start < rows.stop and columns.start < columns.stop else None
+        return (rows, columns) if rows.start < rows.stop and columns.start < columns.stop else none
 
 
 def _met(found: Any) -> Float32[Array, "h w"]:
@@ -108,14 +110,18 @@ def _met(found: Any) -> Float32[Array, "h w"]:
     return np.where(np.isfinite(hit), hit, np.float32(0.0))
 
 
-def _hull_edges(vertices_m: Float[Array, "v 3"], parts: int = 8) -> Float[Array, "n 3"]:
-    """Points along the edges of the convex hull, the farthest out in any image: a lens bends what lies between."""
+def _outermost(vertices_m: Float[Array, "v 3"], bent: bool, parts: int = 8) -> Float[Array, "n 3"]:
+    """Points of the convex hull, the farthest out in any image: its corners, and where a lens has `bent` what lies
+    between them, points along its edges."""
     from scipy.spatial import ConvexHull, QhullError
 
     try:
-        faces = ConvexHull(vertices_m).simplices
+        hull = ConvexHull(vertices_m)
     except (QhullError, ValueError):  # flat, or too few
         return vertices_m
+    if not bent:
+        return vertices_m[hull.vertices]
+    faces = hull.simplices
     ends = np.unique(np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), 1), axis=0)
     share = np.arange(parts + 1)[:, None, None] / parts
     return ((1 - share) * vertices_m[ends[:, 0]] + share * vertices_m[ends[:, 1]]).reshape(-1, 3)

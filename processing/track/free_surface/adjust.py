@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray as Array
-from scipy.linalg import cho_factor, cho_solve
 
 from processing.track.beam import Scene
 from processing.track.depth_color_offset import put_at_color_times
@@ -21,7 +20,7 @@ from processing.track.flags import per_view
 from processing.track.free_surface.appearance import AppearanceTerms
 from processing.track.free_surface.drawn import DrawnViews
 from processing.track.free_surface.surface import FreeSurface
-from processing.track.free_surface.terms import SurfaceMeasurements, SurfaceTerms
+from processing.track.free_surface.terms import SurfaceMeasurements, SurfaceTerms, said_by
 from processing.track.hypotheses import HypothesisConfig, motion_of
 from processing.track.joint_refinement import Motion, choose_pairs, refine
 from processing.track.pairs import compared
@@ -64,7 +63,7 @@ def adjusted(
         _follow(surface, measured, after, used)
         for t, (toss, use) in enumerate(zip(after, used)):
             drawn.draw(t, surface, toss.poses, use)
-        said = [_said(*each) for each in zip(measured, after, used)]
+        said = [said_by(m.of_all(a.poses, use), surface.count) for m, a, use in zip(measured, after, used)]
         for t in range(len(tosses)):
             if used[t].any():
                 free, others = np.flatnonzero(used[t]), np.sum(said, axis=0) - said[t]
@@ -72,7 +71,7 @@ def adjusted(
                 after[t] = _refined(t, tosses, after, used, drawn, terms, scale, config)
                 if t + 1 < len(tosses):  # for the others of this turn; before the next all are drawn
                     drawn.draw(t, surface, after[t].poses, used[t])
-                    said[t] = _said(measured[t], after[t], used[t])
+                    said[t] = said_by(measured[t].of_all(after[t].poses, used[t]), surface.count)
             progress.step(turn * len(tosses) + t + 1, len(APPEARANCE_SCALES) * len(tosses), "tosses")
     return after
 
@@ -88,10 +87,11 @@ def _follow(
 ) -> None:  # fmt: skip
     """Moves the surface to where the views at their poses say that it is."""
     for _ in range(2):  # how far outlines err is told by what the surface leaves of them, and weighs them for it
-        square, gradient = np.sum([_said(*each) for each in zip(measured, tosses, used)], axis=0)
-        offsets_m = -cho_solve(cho_factor(surface.prior + np.diag(square)), gradient + surface.pull)
-        for each, toss, use in zip(measured, tosses, used):
-            each.learn({int(i): each.of(int(i), toss.poses[i])[0] for i in np.flatnonzero(use)}, offsets_m)
+        views = [each.of_all(toss.poses, use) for each, toss, use in zip(measured, tosses, used)]
+        square, gradient = np.sum([said_by(residuals, surface.count) for residuals in views], axis=0)
+        offsets_m = -surface.told(square).solver()((gradient + surface.pull)[:, None])[:, 0]
+        for each, residuals in zip(measured, views):
+            each.learn({i: outline for i, (outline, _) in residuals.items()}, offsets_m)
     surface.move(offsets_m)
     for each in measured:
         each.redraw()
@@ -143,12 +143,3 @@ def _used(toss: PosedToss) -> Bool[Array, " n"]:
     scene = toss.scene
     use = np.isfinite(toss.poses[:, 0, 0]) & np.array([scene.store.usable(i) for i in range(len(toss.poses))])
     return use & put_at_color_times(scene, toss.poses, use)
-
-
-def _said(measured: SurfaceMeasurements, toss: AdjustedToss, use: Bool[Array, " n"]) -> Float[Array, "2 k"]:
-    """What a toss's views at their poses say of the offsets (`Residuals.of_offsets`)."""
-    said = np.zeros((2, measured.surface.count))
-    for i in np.flatnonzero(use):
-        for residuals in measured.of(int(i), toss.poses[i]):
-            said += residuals.of_offsets(len(said[0]))
-    return said

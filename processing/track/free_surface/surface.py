@@ -5,6 +5,7 @@ The surface moves: once its offsets are told they bend it, and it is drawn as it
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -12,6 +13,8 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 from numpy import ndarray as Array
+from scipy.sparse import coo_array, diags_array, eye_array
+from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 
 from processing.sensor.render import RaycastRenderer
@@ -31,13 +34,40 @@ EVEN = 2
 """Times that offsets and normals of vertices are averaged with their neighbours': patches leave no steps."""
 
 
+class OffsetsInformation:
+    """An inverse covariance (1/m^2) of a surface's offsets: a sparse matrix less `mean` everywhere."""
+
+    def __init__(self, sparse: Any, mean: float) -> None:
+        self._sparse, self._mean = sparse, mean
+
+    def times(self, offsets_m: Float[Array, " k"]) -> Float[Array, " k"]:
+        """Its product with offsets."""
+        return np.asarray(self._sparse @ offsets_m - self._mean * offsets_m.sum())
+
+    def with_more(self, information: Float[Array, " k"]) -> OffsetsInformation:
+        """The same with more known of each offset alone."""
+        return OffsetsInformation(self._sparse + diags_array(information), self._mean)
+
+    def solver(self) -> Callable[[Float[Array, "k n"]], Float[Array, "k n"]]:
+        """The product of its inverse with columns (Sherman and Morrison, 1950, for the mean)."""
+        lower = splu(self._sparse.tocsc(), "MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+        ones = lower.solve(np.ones(self._sparse.shape[0]))
+        gain = self._mean / (1 - self._mean * ones.sum())
+
+        def solved(columns: Float[Array, "k n"]) -> Float[Array, "k n"]:
+            return np.asarray(lower.solve(columns) + gain * np.outer(ones, ones @ columns))
+
+        return solved
+
+
 class FreeSurface:
-    """The patches of a shape (object frame), and what is known of their `count` offsets before anything is measured:
-    `prior`, an inverse covariance (1/m^2). `moved_m`: how far each has been moved."""
+    """The patches of a shape (object frame), and what is known of their `count` offsets: they are small, their mean no
+    more so than any one of them, and smooth. `moved_m`: how far each has been moved."""
 
     def __init__(self, shape: ObjectShape, pinhole: CameraModel) -> None:
         """`pinhole`: the camera, rectified."""
-        self._first, self._renderer, self._neighbours = shape, RaycastRenderer(shape, pinhole), _neighbours(shape)
+        self._first, self._pinhole, self._neighbours = shape, pinhole, _neighbours(shape)
+        self._renderer = RaycastRenderer(shape, pinhole)
         self._seen = np.ones(len(shape.faces), bool) if shape.observed is None else shape.observed[shape.faces].all(1)
         self._put(shape)
         size_m = float(np.linalg.norm(np.ptp(shape.vertices_m, axis=0)))
@@ -46,8 +76,11 @@ class FreeSurface:
         self.count = int(self.patch.max()) + 1
         mean = np.stack([np.bincount(self.patch, axis, self.count) for axis in self.normals.T], -1)
         self.patch_normals = mean / np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-9)
-        alone = np.eye(self.count) - (1 - 1 / self.count) / self.count  # of their mean no more than of any one
-        self.prior = _smooth(shape.faces, self.patch, self.patch_normals) + alone / OFFSET_SIGMA_M**2
+        own = diags_array(np.full(self.count, OFFSET_SIGMA_M**-2.0))
+        self._prior = OffsetsInformation(
+            _smooth(shape.faces, self.patch, self.patch_normals) + own,
+            (1 - 1 / self.count) / self.count / OFFSET_SIGMA_M**2,
+        )
         self.moved_m = np.zeros(self.count)
         ways = self._even(self.normals)
         self._ways = ways / np.maximum(np.linalg.norm(ways, axis=1, keepdims=True), 1e-9)
@@ -55,7 +88,11 @@ class FreeSurface:
     @property
     def pull(self) -> Float[Array, " k"]:
         """The prior's gradient by further offsets: back to the surface as it was."""
-        return np.asarray(self.prior @ self.moved_m)
+        return self._prior.times(self.moved_m)
+
+    def told(self, information: Float[Array, " k"]) -> OffsetsInformation:
+        """What is known of the offsets once so much (1/m^2) was measured of each."""
+        return self._prior.with_more(information)
 
     def move(self, offsets_m: Float[Array, " k"]) -> None:
         """Moves every patch on by its offset."""
@@ -65,8 +102,10 @@ class FreeSurface:
 
     def depth(self, camera_from_object: Float[Array, "4 4"]) -> Float32[Array, "h w"]:
         """Depth (m) of the surface at a pose; 0 beside it, and where no view saw it."""
-        depth_m, face, _ = self._renderer.hits(camera_from_object)
-        return np.where(self._seen[face], depth_m, np.float32(0))
+        hits = self._renderer.hits(camera_from_object)
+        out = np.zeros((self._pinhole.height, self._pinhole.width), dtype=np.float32)
+        out[hits.box] = np.where(self._seen[hits.face], hits.depth_m, np.float32(0))
+        return out
 
     def _put(self, shape: ObjectShape) -> None:
         self._renderer.show(shape)
@@ -86,27 +125,23 @@ class FreeSurface:
     def outline(self, camera_from_object: Float[Array, "4 4"]) -> tuple[Float[Array, "n 3"], Int[Array, " n"], float]:
         """What the outline of the shape at a pose is made of: points of the surface (object frame, m), each one's
         nearest vertex, and how many pixels of the outline a point stands for. Parts that no view saw are left out."""
-        depth_m, face, within = self._renderer.hits(camera_from_object)
-        v, u = _border(depth_m > 0)
-        seen = self._seen[face[v, u]]
+        hits = self._renderer.hits(camera_from_object)
+        v, u = np.nonzero(_border(hits.depth_m > 0))
+        seen = self._seen[hits.face[v, u]]
         v, u = v[seen], u[seen]
         some = np.unique(np.linspace(0, len(v) - 1, MOST_POINTS).astype(int)) if len(v) else np.zeros(0, dtype=int)
         share, v, u = len(v) / max(len(some), 1), v[some], u[some]
-        corners = self._first.faces[face[v, u]]
-        points = np.einsum("nc,ncj->nj", within[v, u].astype(np.float64), self.vertices_m[corners])
+        corners = self._first.faces[hits.face[v, u]]
+        points = np.einsum("nc,ncj->nj", hits.weight[v, u].astype(np.float64), self.vertices_m[corners])
         return points, corners[:, 0], share
 
 
-def _border(body: Bool[Array, "h w"]) -> tuple[Int[Array, " n"], Int[Array, " n"]]:
-    """Rows and columns of its pixels that have a neighbour which is not; where the image ends, it goes on."""
-    rows, columns = np.flatnonzero(body.any(1)), np.flatnonzero(body.any(0))
-    if len(rows) == 0:
-        return rows, columns
-    top, left = max(rows[0] - 1, 0), max(columns[0] - 1, 0)
-    part = body[top : rows[-1] + 2, left : columns[-1] + 2]
-    inner = cv2.erode(part.astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))) > 0
-    v, u = np.nonzero(part & ~inner)
-    return v + top, u + left
+def _border(body: Bool[Array, "h w"]) -> Bool[Array, "h w"]:
+    """Its pixels that have a neighbour which is not; where the image ends, it goes on."""
+    if body.size == 0:
+        return body
+    inner = cv2.erode(body.astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))) > 0
+    return np.asarray(body & ~inner)
 
 
 def _vertex_normals(shape: ObjectShape) -> Float[Array, "v 3"]:
@@ -119,8 +154,6 @@ def _vertex_normals(shape: ObjectShape) -> Float[Array, "v 3"]:
 
 def _neighbours(shape: ObjectShape) -> Any:
     """Matrix (sparse, v x v) of the mean over a vertex and those that share an edge with it."""
-    from scipy.sparse import coo_array, diags_array, eye_array
-
     count = len(shape.vertices_m)
     a, b = shape.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).T
     touch = coo_array((np.ones(2 * len(a)), (np.r_[a, b], np.r_[b, a])), shape=(count, count)).tocsr()
@@ -139,12 +172,10 @@ def _patches(vertices_m: Float[Array, "v 3"], normals: Float[Array, "v 3"], widt
 
 def _smooth(
     faces: Int[Array, "f 3"], patch: Int[Array, " v"], normals: Float[Array, "k 3"]
-) -> Float[Array, "k k"]:  # fmt: skip
-    """Inverse covariance by which patches that touch, and face alike, have like offsets."""
-    out = np.zeros((len(normals), len(normals)))
+) -> Any:  # fmt: skip
+    """Inverse covariance (sparse, k x k) by which patches that touch, and face alike, have like offsets."""
     touch = np.unique(np.sort(patch[faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)], axis=1), axis=0)
     a, b = touch[touch[:, 0] != touch[:, 1]].T
     alike = np.maximum(np.einsum("nj,nj->n", normals[a], normals[b]), 0) ** 2 / SMOOTH_SIGMA_M**2
-    for row, column, sign in ((a, a, 1), (b, b, 1), (a, b, -1), (b, a, -1)):
-        np.add.at(out, (row, column), sign * alike)
-    return out
+    values = np.r_[alike, alike, -alike, -alike]
+    return coo_array((values, (np.r_[a, b, a, b], np.r_[a, b, b, a])), shape=(len(normals), len(normals))).tocsc()

@@ -16,7 +16,6 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 from numpy import ndarray as Array
-from scipy.linalg import cho_factor, cho_solve
 
 from processing.motion import se3_kernels as se3
 from processing.sensor import view_layout as lay
@@ -69,6 +68,15 @@ class Residuals:
         return np.stack([np.bincount(self.patch, by * x, count) for x in (self.by_offset, self.value_m)])
 
 
+def said_by(views: Mapping[int, tuple[Residuals, Residuals]], count: int) -> Float[Array, "2 k"]:
+    """What residuals of views say of the offsets (`Residuals.of_offsets`)."""
+    said = np.zeros((2, count))
+    for both in views.values():
+        for residuals in both:
+            said += residuals.of_offsets(count)
+    return said
+
+
 class SurfaceMeasurements:
     """What views of a toss measure of a free surface."""
 
@@ -83,6 +91,10 @@ class SurfaceMeasurements:
     def of(self, view: int, pose: Float[Array, "4 4"]) -> tuple[Residuals, Residuals]:
         """Residuals of a view's outline and of its depth at a pose (camera_from_object)."""
         return self._of_outline(view, pose), self._of_depth(view, pose)
+
+    def of_all(self, poses: Float[Array, "n 4 4"], use: Bool[Array, " n"]) -> dict[int, tuple[Residuals, Residuals]]:
+        """Those of all views in `use`."""
+        return {int(i): self.of(int(i), poses[i]) for i in np.flatnonzero(use)}
 
     def redraw(self) -> None:
         """Outlines are drawn anew: the surface has moved."""
@@ -201,12 +213,12 @@ class SurfaceTerms:
                 couplings.append(coupling)
                 free.append(int(place[i]))
         surface = self._measured.surface
-        factor = cho_factor(surface.prior + np.diag(said[0]), lower=True)
-        offsets_m = -cho_solve(factor, said[1] + surface.pull)
+        solved = surface.told(said[0]).solver()
+        offsets_m = -solved((said[1] + surface.pull)[:, None])[:, 0]
         self._measured.learn(outlines, offsets_m)
         if free:
             C, places = np.concatenate(couplings), np.array(free)
-            shared = (C @ cho_solve(factor, C.T)).reshape(len(places), 6, len(places), 6).transpose(0, 2, 1, 3)
+            shared = (C @ solved(C.T)).reshape(len(places), 6, len(places), 6).transpose(0, 2, 1, 3)
             np.subtract.at(H, (places[:, None], places[None]), shared)
             np.add.at(g, places, (C @ offsets_m).reshape(-1, 6))
 
@@ -247,4 +259,6 @@ def _by_twist(
 ) -> Float[Array, "n 6"]:  # fmt: skip
     """Derivatives by the twist of the object frame (`joint_refinement`) of what changes with points x of the body
     (camera frame) by `slope`."""
-    return -np.concatenate([slope, np.cross(x, slope)], axis=1) @ se3.adjoint(np.ascontiguousarray(pose))
+    (x, y, z), (a, b, c) = x.T, slope.T
+    turning = (y * c - z * b, z * a - x * c, x * b - y * a)
+    return -np.stack([a, b, c, *turning], axis=1) @ se3.adjoint(np.ascontiguousarray(pose))
