@@ -54,7 +54,10 @@ class CycleConfig:
     apart_mask: float = 0.12
     """A toss whose outline the common shape misses by more (1 - IoU, median over frames) is not of that shape."""
     much_worse: float = 0.02
-    """A second pass whose residuals on the raw images are larger by more than this is kept out, and said to be."""
+    """A second pass whose residuals on the raw images are larger by more than this is kept out, and said to be ..."""
+    far_deg: float = 2.0
+    """... and so is one that refines the first pass's poses and turns them by more (median over frames): those err by 2
+    to 3 degrees, the surface free; what pulls farther is an error of the shape (docs/decisions/second-pass.md)."""
     most_passes: int = 3
     """After the second one, where passes go on until they converge."""
     same_rotation_deg: float = 0.05

@@ -36,9 +36,12 @@ def run_cycle(run: Run, variant: Variant, start: Pass, images: Mapping[int, Imag
     ends_here = variant.refined != "converged"
     refined, second, change = once_more(run, start, images, name, variant.contact, variant.icp, rollouts=ends_here)
     notes = () if "contact_j" in change["before"] else (why_not_by_contact(len(start.tracks)),)
-    if change["worse_share"] > config.much_worse:
-        return replace(refined, passes=(change,), notes=(*refined.notes, *notes),
-                       warnings=(*refined.warnings, say.second_pass_not_kept(change)))  # fmt: skip
+    drawn_off = config.start != "anew" and change["rotation_deg"] > config.far_deg
+    if change["worse_share"] > config.much_worse or drawn_off:
+        left_out = say.second_pass_not_kept(change, config)
+        return replace(
+            refined, passes=(change,), notes=(*refined.notes, *notes), warnings=(*refined.warnings, left_out)
+        )
     notes = (*second.notes, *notes, *say.second_pass_kept(change, config), *say.departures(config))
     second = replace(second, passes=(change,), notes=notes)
     return until_converged(run, second, images, name) if variant.refined == "converged" else second

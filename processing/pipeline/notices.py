@@ -180,12 +180,13 @@ def no_rollouts(done: Done[RolloutResult]) -> tuple[Notice, ...]:
     return (Notice("rollout", "low", f"no rollouts: {why}"),) if why else ()
 
 
-def second_pass_not_kept(comparison: Mapping[str, Any]) -> Notice:
-    """The second pass explains the raw images worse."""
-    seen = (
-        f"{comparison['of']}: the second pass was not kept: it explains the raw images {_percent(comparison)} "
-        "worse than the first"
-    )
+def second_pass_not_kept(comparison: Mapping[str, Any], config: CycleConfig) -> Notice:
+    """The second pass explains the raw images worse, or turns the poses by more than they err."""
+    if comparison["worse_share"] > config.much_worse:
+        why = f"it explains the raw images {_percent(comparison)} worse than the first"
+    else:
+        why = f"it turns the poses by {comparison['rotation_deg']:.1f} deg; wanted at most {config.far_deg:g}"
+    seen = f"{comparison['of']}: the second pass was not kept: {why}"
     return Notice("second pass", "low", seen, "poses and shape are those before it")
 
 

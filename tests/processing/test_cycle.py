@@ -12,7 +12,7 @@ import pytest
 import trimesh
 
 from processing.cli import config_of, main
-from processing.config import Config
+from processing.config import Config, CycleConfig
 from processing.evaluate.table import said
 from processing.field.learn import LearnConfig
 from processing.field.train import FieldConfig
@@ -259,7 +259,8 @@ def test_passes_go_on_while_the_raw_images_are_explained_better_and_the_best_is_
 
     def another(run: Any, best: Pass, *_: Any, **__: Any) -> tuple[Pass, Pass, dict[str, Any]]:
         after = Pass({}, {}, shared_frame=True, notes=(f"made by pass {next(count)}",))
-        return best, after, {"of": "x", "before": {}, "worse_share": next(judged), "same": False}
+        told = {"of": "x", "before": {}, "worse_share": next(judged), "rotation_deg": 0.5, "same": False}
+        return best, after, told
 
     monkeypatch.setattr(cycle, "once_more", another)
     session = Session.open(SAMPLE)
@@ -268,6 +269,31 @@ def test_passes_go_on_while_the_raw_images_are_explained_better_and_the_best_is_
     assert ended.notes[0] == "made by pass 4"
     assert "pass 5 explains the raw images no better" in ended.notes[-1]
     assert [p["worse_share"] for p in ended.passes] == [0.001, -0.02, -0.01, 0.0005]
+
+
+@pytest.mark.parametrize(
+    ("told", "start", "kept"),
+    [
+        ({"worse_share": 0.019, "rotation_deg": 1.9}, "shape", None),
+        ({"worse_share": 0.021, "rotation_deg": 0.1}, "shape", "explains the raw images 2.1 % worse"),
+        ({"worse_share": -0.05, "rotation_deg": 2.4}, "shape", "turns the poses by 2.4 deg"),
+        ({"worse_share": -0.05, "rotation_deg": 70.0}, "anew", None),
+    ],
+)
+def test_a_second_pass_that_explains_less_or_turns_the_poses_it_refines_far_is_left_out_and_said_to_be(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, told: dict[str, float], start: Any, kept: str | None
+) -> None:
+    from processing.pipeline import cycle
+
+    after = Pass({}, {}, shared_frame=True, notes=("made by pass 2",))
+    change = {"of": "x", "before": {}, "same": False, **told}
+    monkeypatch.setattr(cycle, "once_more", lambda run, first, *_, **__: (first, after, change))
+    session = Session.open(SAMPLE)
+    config = replace(Config(), cycle=CycleConfig(start=start))
+    run = start_run(session, session.tosses, tmp_path, config, TRACKERS[0], lambda _: Silent())
+    ended = cycle.run_cycle(run, find_variant("ours"), Pass({}, {}, shared_frame=True), {}, "x")
+    assert ("made by pass 2" in ended.notes) == (kept is None)
+    assert [kept in w.seen for w in ended.warnings] == ([True] if kept else [])
 
 
 @pytest.mark.slow
