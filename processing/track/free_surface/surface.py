@@ -90,7 +90,7 @@ class FreeSurface:
         """The prior's gradient by further offsets: back to the surface as it was."""
         return self._prior.times(self.moved_m)
 
-    def told(self, information: Float[Array, " k"]) -> OffsetsInformation:
+    def with_measured(self, information: Float[Array, " k"]) -> OffsetsInformation:
         """What is known of the offsets once so much (1/m^2) was measured of each."""
         return self._prior.with_more(information)
 

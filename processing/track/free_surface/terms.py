@@ -213,7 +213,7 @@ class SurfaceTerms:
                 couplings.append(coupling)
                 free.append(int(place[i]))
         surface = self._measured.surface
-        solved = surface.told(said[0]).solver()
+        solved = surface.with_measured(said[0]).solver()
         offsets_m = -solved((said[1] + surface.pull)[:, None])[:, 0]
         self._measured.learn(outlines, offsets_m)
         if free:

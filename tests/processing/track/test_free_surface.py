@@ -115,7 +115,7 @@ def test_outlines_alone_tell_the_surface_both_ways(tosses, smaller_m):
     measured = measured_by(tosses[0], smaller_m)
     measured.sigma_px = LEAST_SIGMA_PX
     said = sum(measured.of(i, p)[0].of_offsets(measured.surface.count) for i, p in enumerate(true_poses(1)))
-    offsets_m = -measured.surface.told(said[0]).solver()(said[1][:, None])[:, 0]
+    offsets_m = -measured.surface.with_measured(said[0]).solver()(said[1][:, None])[:, 0]
     told = said[0] > np.median(said[0][said[0] > 0])
     assert told.sum() > 40
     assert np.median(offsets_m[told]) == pytest.approx(smaller_m, rel=0.3)  # less: they are held to 0
