@@ -50,12 +50,12 @@ class OffsetsInformation:
 
     def solver(self) -> Callable[[Float[Array, "k n"]], Float[Array, "k n"]]:
         """The product of its inverse with columns (Sherman and Morrison, 1950, for the mean)."""
-        lower = splu(self._sparse.tocsc(), "MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-        ones = lower.solve(np.ones(self._sparse.shape[0]))
+        factor = splu(self._sparse.tocsc(), "MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+        ones = factor.solve(np.ones(self._sparse.shape[0]))
         gain = self._mean / (1 - self._mean * ones.sum())
 
         def solved(columns: Float[Array, "k n"]) -> Float[Array, "k n"]:
-            return np.asarray(lower.solve(columns) + gain * np.outer(ones, ones @ columns))
+            return np.asarray(factor.solve(columns) + gain * np.outer(ones, ones @ columns))
 
         return solved
 

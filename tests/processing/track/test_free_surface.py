@@ -150,6 +150,24 @@ def test_a_surface_that_moved_is_drawn_where_it_is_and_held_by_what_was_known(gr
     assert surface.pull @ surface.moved_m == pytest.approx((grown_m / OFFSET_SIGMA_M) ** 2)  # as likely as one patch's
 
 
+def test_offsets_are_solved_for_by_all_that_is_known_of_them():
+    random = np.random.default_rng(4)
+    surface = FreeSurface(ellipsoid(), CAMERA)
+    known = surface.with_measured(np.where(random.random(surface.count) < 0.5, 0.0, 1e7 * random.random(surface.count)))
+    columns = random.normal(size=(surface.count, 3))
+    for column, offsets_m in zip(columns.T, known.solver()(columns).T):
+        np.testing.assert_allclose(known.times(offsets_m), column, atol=1e-9)
+
+
+def test_a_surface_beside_the_image_has_no_depth_and_no_outline():
+    surface, pose = FreeSurface(ellipsoid(), CAMERA), true_poses(1)[4]
+    pose[:3, 3] = [5.0, 0.0, FAR_M]
+    assert not surface.depth(pose).any()
+    points, vertices, _ = surface.outline(pose)
+    assert points.shape == (0, 3)
+    assert vertices.shape == (0,)
+
+
 def test_what_no_view_saw_of_a_surface_has_no_depth():
     half = replace(ellipsoid(), observed=ellipsoid().vertices_m[:, 0] > 0)
     depth_m, whole_m = (FreeSurface(s, CAMERA).depth(true_poses(1)[4]) for s in (half, ellipsoid()))
