@@ -148,6 +148,7 @@ def test_a_corner_of_the_image_that_no_view_reached_is_explained_better_than_by_
     assert np.linalg.norm(ours) < np.linalg.norm(plain)
 
 
+@pytest.mark.slow
 def test_a_lens_that_bends_by_k3_where_views_reach_is_given_it(geometry):
     rng = np.random.default_rng(1)
     true = geometry.camera("mono0", 400.0, distortion_model="brown-conrady", distortion=(-0.3, 0.2, 0.0, 0.0, -0.1))

@@ -120,6 +120,7 @@ def test_json_is_one_object_and_the_rest_goes_to_stderr(
     assert document["rows"][0]["per_toss"][0]["tracked"] == 8
 
 
+@pytest.mark.slow
 def test_both_layouts_of_the_truth_give_the_same_scores(
     tiny_world: Any, record_tiny: Record, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -212,6 +213,7 @@ def test_a_run_killed_in_the_middle_resumes_to_the_same_table(record_tiny: Recor
     assert (tmp_path / "killed" / "table.json").read_text() == (tmp_path / "whole" / "table.json").read_text()
 
 
+@pytest.mark.slow
 def test_two_runs_at_once_on_one_results_folder_both_finish(record_tiny: Record, tmp_path: Path) -> None:
     session, out = record_tiny(tosses=(0,), frames=5), tmp_path / "out"
     code = "import sys; from processing.cli import main; sys.exit(main(sys.argv[1:]))"

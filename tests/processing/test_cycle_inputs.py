@@ -225,6 +225,7 @@ def one_lost(two_objects: tuple[Path, Results], tmp_path_factory: pytest.TempPat
     return Results.open(out)
 
 
+@pytest.mark.slow
 def test_a_toss_of_another_object_keeps_its_own_track_and_shape_and_is_not_learned_from(
     two_objects: tuple[Path, Results],
 ) -> None:
@@ -241,6 +242,7 @@ def test_a_toss_of_another_object_keeps_its_own_track_and_shape_and_is_not_learn
     assert sizes[0] < 0.12 < sizes[1]  # the other object is 14 cm long
 
 
+@pytest.mark.slow
 def test_a_toss_of_another_object_that_shows_no_shape_of_its_own_is_lost_and_counted(one_lost: Results) -> None:
     record, tracks = one_lost.find("ours", "all"), one_lost.tracks("ours", "all")
     said = "tosses [1] could not be brought into the object frame of the others: lost"
@@ -256,12 +258,14 @@ def test_a_toss_of_another_object_that_shows_no_shape_of_its_own_is_lost_and_cou
     assert np.ptp(one_lost.shape("ours", "all").vertices_m, axis=0).max() < 0.12
 
 
+@pytest.mark.slow
 def test_a_lost_toss_stays_lost_in_scope_one(one_lost: Results) -> None:
     tracks = one_lost.tracks("ours", "one")
     assert tracks[1].lost.all()
     assert not tracks[0].lost.any()
 
 
+@pytest.mark.slow
 def test_the_second_pass_leaves_a_lost_toss_as_it_was_and_judges_the_others(one_lost: Results) -> None:
     (told,) = one_lost.find("ours", "all").extra["passes"]
     assert told["before"]["frames"] == told["after"]["frames"] == 2

@@ -33,6 +33,7 @@ def test_a_kernel_that_does_not_compile_ends_set_up_with_a_sentence(tool, capfd)
     assert "no_such_kernels" in capfd.readouterr().err
 
 
+@pytest.mark.slow
 def test_what_was_compiled_ahead_is_found_by_the_first_call(tmp_path):
     """By a process of its own: numba keeps what it compiled by the types of a call."""
     ahead = "import compile_kernels as c; c.compiled('processing.motion.se3_kernels')"

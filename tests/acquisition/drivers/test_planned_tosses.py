@@ -110,6 +110,7 @@ def test_a_planned_toss_of_the_ur5e_runs_and_reaches_its_speed(rtde: tuple[str, 
     assert 0.7 * wanted_speed < speed < 1.35 * wanted_speed
 
 
+@pytest.mark.slow
 def test_the_shipped_ur5e_rig_tosses(rtde: tuple[str, ChildProcess], tmp_path: Path) -> None:
     """Its arm alone, with the toss that the file asks for: to the start, the toss, and what is written of it."""
     shipped = read_rig(find_rig("ur5e"))
@@ -176,6 +177,7 @@ posts = []
 BASE = Transform("world", "base", rotation_exp(np.array([0.0, 0.0, -np.pi / 2])), np.array([0.0, 0.6, 0.0]))
 
 
+@pytest.mark.slow
 def test_toss_record_tosses_with_a_panda(
     fci: tuple[str, ChildProcess], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

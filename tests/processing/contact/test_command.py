@@ -200,6 +200,7 @@ def test_a_duplicate_across_training_and_test_is_refused(simulated_tosses, tmp_p
         contact_only(session, tmp_path / "out", train="0-2", test="7")
 
 
+@pytest.mark.slow
 def test_more_steps_than_any_toss_has_end_with_the_longest_one_and_it_is_said(poses_session, tmp_path):
     """And a track that was asked for where there is none is said to be the imported poses."""
     document, text = contact_only(

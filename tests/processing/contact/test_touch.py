@@ -119,6 +119,7 @@ def test_a_session_whose_plane_is_far_too_high_is_refused_before_learning(real_t
         learn_contact(tracks, prior_from_size("box", 0.05), cube_physics)
 
 
+@pytest.mark.slow
 def test_at_camera_rates_a_box_is_forecast_best_on_its_own_plane(box_body, box_physics):
     """The plane was said 6 mm too high, so the box was learned smaller by that all around."""
     half_m = np.array([0.05, 0.04, 0.03]) - 0.006

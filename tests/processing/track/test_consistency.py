@@ -80,6 +80,7 @@ def turned_deg(fit: Fit) -> float:
     return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
 
 
+@pytest.mark.slow
 def test_free_space_tells_which_way_a_body_lies_that_is_nearly_symmetric() -> None:
     """Nothing is seen twice and nothing has colours: a third of a turn is nearly as good, and yet worse."""
     both = inconsistency(prism(SLENDER, 0.166, None), apart=True)

@@ -208,6 +208,7 @@ def test_a_toss_is_placed_in_the_frame_of_a_known_shape(tiny_world: Any, toss: T
     assert errors.translation_m.max() < 0.005
 
 
+@pytest.mark.slow
 def test_a_toss_of_an_object_with_twins_is_said_to_be_ambiguous(tiny_world: Any, toss: Toss) -> None:
     """A box without colours fits onto itself in four ways: one of them is taken, and nobody is told that it is sure."""
     grey = [replace(f, color_rgb=np.full_like(f.color_rgb, 128)) for f in toss[0][:5]]

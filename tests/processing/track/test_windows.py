@@ -116,6 +116,7 @@ def test_the_live_looks_settings_lay_no_windows(scene: Scene) -> None:
     assert through_windows(scene, 0, wrong, config.beam.keyframes, config.windows, config.hypotheses) == []
 
 
+@pytest.mark.slow
 def test_the_share_that_is_done_grows(scene: Scene) -> None:
     wrong, config = [sliding(scene, np.zeros(3)), sliding(scene, np.array([0.0, 4.0, 0.0]))], TrackConfig()
     told: list[float] = []

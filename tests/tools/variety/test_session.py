@@ -233,6 +233,7 @@ def armed():
     return replace(drawn, family="box", camera=replace(drawn.camera, focal_px=390.0, distance_m=0.9))
 
 
+@pytest.mark.slow
 def test_the_arm_holds_the_object_until_it_opens_and_then_it_flies():
     drawn = armed()
     built = scene.build(drawn)
