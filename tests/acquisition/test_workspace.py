@@ -116,6 +116,7 @@ def test_between_any_low_poses_an_approach_keeps_table_and_box_or_is_refused_wit
     assert room_m > -STEP_M / 2
 
 
+@pytest.mark.slow
 def test_where_no_way_leads_round_the_place_is_named() -> None:
     start, goal = PANDA.ready_rad.copy(), PANDA.ready_rad.copy()
     start[0], goal[0] = -1.2, 1.2

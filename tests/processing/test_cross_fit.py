@@ -311,7 +311,7 @@ def test_a_shape_that_fits_nothing_locates_no_toss(
     assert cross_fit.located_on(tosses.run, tosses.images[0], Done(tmp_path, "shape", None, False)) is None
 
 
-@pytest.mark.parametrize("drifted", [0, 1])
+@pytest.mark.parametrize("drifted", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_a_toss_that_was_not_joined_is_found_on_the_shape_of_the_others(
     drifted: int, tiny_world: Any, tmp_path: Path
 ) -> None:

@@ -78,6 +78,7 @@ with GenicamCamera(serial=sys.argv[1], settings=GenicamSettings(rate_hz=50.0, pa
 """
 
 
+@pytest.mark.slow
 def test_a_camera_of_another_program_is_refused_and_one_whose_program_died_streams(
     three: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -147,6 +147,7 @@ def test_a_plane_that_contradicts_what_the_camera_saw_is_refused(simulated_tosse
         learn_from_tracks(tracks, noisy_box(), raised, config=QUICK)
 
 
+@pytest.mark.slow
 def test_spikes_below_the_table_do_not_keep_contact_out(simulated_tosses):
     """Six blobs of 9 mm on each face, as a field leaves them: the lowest vertex is far below the table at rest, the
     surface is not. A shape that is sunk as a whole is still refused."""

@@ -72,6 +72,7 @@ def test_a_raised_and_tilted_plane_is_the_same_lab(simulated_tosses, box_physics
     np.testing.assert_allclose([e.value for e in other.extents], [e.value for e in one.extents], atol=2e-4)
 
 
+@pytest.mark.slow
 def test_an_impact_that_the_plane_cannot_explain_is_left_out_and_counted(simulated_tosses, box_physics):
     tracks = simulated_tosses(3)
     hit = tracks[0]

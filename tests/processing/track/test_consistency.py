@@ -98,6 +98,7 @@ def test_a_body_that_is_symmetric_lies_in_several_ways_of_which_none_is_better()
     assert min(f.cost for f in twins) - truth < AMBIGUOUS
 
 
+@pytest.mark.slow
 def test_appearance_tells_the_ways_of_a_symmetric_body_apart() -> None:
     both = inconsistency(prism(REGULAR, 0.166, ([200, 40, 40], [40, 200, 40], [40, 40, 200])), apart=False)
     found = both.fitted(both.all_around())

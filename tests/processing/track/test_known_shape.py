@@ -160,6 +160,7 @@ def test_tracking_goes_both_ways_from_a_given_frame(tiny_world: Any, toss: Toss)
     assert metres < 0.004
 
 
+@pytest.mark.slow
 def test_the_colour_of_an_occluder_does_not_count_where_it_is_said_to_be_foreign(tiny_world: Any, toss: Toss) -> None:
     """A bar that moves with the camera, painted over the object; the depth is the object's own."""
     painted, foreign = [], []

@@ -44,6 +44,7 @@ def noisy(frames: Any, noise: DepthNoise, seed: int) -> list[Any]:
     return found
 
 
+@pytest.mark.slow
 def test_frames_of_a_coarse_camera_that_lie_right_are_not_lost(tiny_world: Any) -> None:
     poses = tiny_world.poses(5, 0)
     seen = [tiny_world.see(pose, i) for i, pose in enumerate(poses)]
