@@ -89,7 +89,7 @@ def _follow(
     for _ in range(2):  # how far outlines err is told by what the surface leaves of them, and weighs them for it
         views = [each.of_all(toss.poses, use) for each, toss, use in zip(measured, tosses, used)]
         square, gradient = np.sum([said_by(residuals, surface.count) for residuals in views], axis=0)
-        offsets_m = -surface.with_measured(square).solver()((gradient + surface.pull)[:, None])[:, 0]
+        offsets_m = -surface.prior.with_more(square).solver()(gradient + surface.pull)
         for each, residuals in zip(measured, views):
             each.learn({i: outline for i, (outline, _) in residuals.items()}, offsets_m)
     surface.move(offsets_m)

@@ -48,21 +48,22 @@ class OffsetsInformation:
         """The same with more known of each offset alone."""
         return OffsetsInformation(self._sparse + diags_array(information), self._mean)
 
-    def solver(self) -> Callable[[Float[Array, "k n"]], Float[Array, "k n"]]:
-        """The product of its inverse with columns (Sherman and Morrison, 1950, for the mean)."""
+    def solver(self) -> Callable[[Float[Array, "k ..."]], Float[Array, "k ..."]]:
+        """The product of its inverse with a vector or columns (Sherman and Morrison, 1950, for the mean)."""
         factor = splu(self._sparse.tocsc(), "MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
         ones = factor.solve(np.ones(self._sparse.shape[0]))
         gain = self._mean / (1 - self._mean * ones.sum())
 
-        def solved(columns: Float[Array, "k n"]) -> Float[Array, "k n"]:
-            return np.asarray(factor.solve(columns) + gain * np.outer(ones, ones @ columns))
+        def solved(columns: Float[Array, "k ..."]) -> Float[Array, "k ..."]:
+            return np.asarray(factor.solve(columns) + gain * np.multiply.outer(ones, ones @ columns))
 
         return solved
 
 
 class FreeSurface:
-    """The patches of a shape (object frame), and what is known of their `count` offsets: they are small, their mean no
-    more so than any one of them, and smooth. `moved_m`: how far each has been moved."""
+    """The patches of a shape (object frame), and what is known of their `count` offsets before anything is measured
+    (`prior`): they are small, their mean no more so than any one of them, and smooth. `moved_m`: how far each has been
+    moved."""
 
     def __init__(self, shape: ObjectShape, pinhole: CameraModel) -> None:
         """`pinhole`: the camera, rectified."""
@@ -77,7 +78,7 @@ class FreeSurface:
         mean = np.stack([np.bincount(self.patch, axis, self.count) for axis in self.normals.T], -1)
         self.patch_normals = mean / np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-9)
         own = diags_array(np.full(self.count, OFFSET_SIGMA_M**-2.0))
-        self._prior = OffsetsInformation(
+        self.prior = OffsetsInformation(
             _smooth(shape.faces, self.patch, self.patch_normals) + own,
             (1 - 1 / self.count) / self.count / OFFSET_SIGMA_M**2,
         )
@@ -88,11 +89,7 @@ class FreeSurface:
     @property
     def pull(self) -> Float[Array, " k"]:
         """The prior's gradient by further offsets: back to the surface as it was."""
-        return self._prior.times(self.moved_m)
-
-    def with_measured(self, information: Float[Array, " k"]) -> OffsetsInformation:
-        """What is known of the offsets once so much (1/m^2) was measured of each."""
-        return self._prior.with_more(information)
+        return self.prior.times(self.moved_m)
 
     def move(self, offsets_m: Float[Array, " k"]) -> None:
         """Moves every patch on by its offset."""

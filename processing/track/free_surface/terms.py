@@ -213,8 +213,8 @@ class SurfaceTerms:
                 couplings.append(coupling)
                 free.append(int(place[i]))
         surface = self._measured.surface
-        solved = surface.with_measured(said[0]).solver()
-        offsets_m = -solved((said[1] + surface.pull)[:, None])[:, 0]
+        solved = surface.prior.with_more(said[0]).solver()
+        offsets_m = -solved(said[1] + surface.pull)
         self._measured.learn(outlines, offsets_m)
         if free:
             C, places = np.concatenate(couplings), np.array(free)

@@ -115,7 +115,7 @@ def test_outlines_alone_tell_the_surface_both_ways(tosses, smaller_m):
     measured = measured_by(tosses[0], smaller_m)
     measured.sigma_px = LEAST_SIGMA_PX
     said = sum(measured.of(i, p)[0].of_offsets(measured.surface.count) for i, p in enumerate(true_poses(1)))
-    offsets_m = -measured.surface.with_measured(said[0]).solver()(said[1][:, None])[:, 0]
+    offsets_m = -measured.surface.prior.with_more(said[0]).solver()(said[1])
     told = said[0] > np.median(said[0][said[0] > 0])
     assert told.sum() > 40
     assert np.median(offsets_m[told]) == pytest.approx(smaller_m, rel=0.3)  # less: they are held to 0
@@ -153,7 +153,8 @@ def test_a_surface_that_moved_is_drawn_where_it_is_and_held_by_what_was_known(gr
 def test_offsets_are_solved_for_by_all_that_is_known_of_them():
     random = np.random.default_rng(4)
     surface = FreeSurface(ellipsoid(), CAMERA)
-    known = surface.with_measured(np.where(random.random(surface.count) < 0.5, 0.0, 1e7 * random.random(surface.count)))
+    told = random.random(surface.count) < 0.5
+    known = surface.prior.with_more(np.where(told, 1e7 * random.random(surface.count), 0.0))
     columns = random.normal(size=(surface.count, 3))
     for column, offsets_m in zip(columns.T, known.solver()(columns).T):
         np.testing.assert_allclose(known.times(offsets_m), column, atol=1e-9)
