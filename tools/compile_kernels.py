@@ -23,7 +23,7 @@ TRACK, FLIGHT = "processing.track.kernels", "processing.track.flight_kernels"
 DEPTH_ERROR, FREE_SURFACE = "processing.track.depth_error.kernels", "processing.track.free_surface.kernels"
 CONSISTENCY, APPEARANCE = "processing.track.registration.consistency_kernels", "processing.track.appearance_ratio"
 STEPS, SOLVER = "processing.contact.physics.steps_cpu", "processing.contact.physics.solver_cpu"
-SE3 = "processing.motion.se3_kernels"
+SE3, TWIST = "processing.motion.se3_kernels", "processing.motion.twist_terms"
 PROFILE = "processing.track.revolution.profile_kernels"
 AZIMUTH = "processing.track.revolution.azimuth_kernels"
 F8, F4, I8 = "float64", "float32", "int64"
@@ -35,10 +35,10 @@ ROLL = (T, M, M, M, VI, M, M, M, F8, I8, I8, F8)
 KERNELS: dict[tuple[str, str], list[tuple[str, ...]]] = {
     (SE3, "exponential"): [(V,)],
     (SE3, "inverse"): [(M,)],
+    (TWIST, "to_object"): [(M, V, M, F8, M, V)],
     (TRACK, "align_view"): [(M, I8, VI, T, M4, M4, MI, V, V, M, V, M)],
     (TRACK, "graph_terms"): [(T, MI, M4, M4, MI, V, V, V, F8, "boolean", T, M, T, T, M)],
     (TRACK, "view_terms"): [(M, I8, VI, T, M4, M4, MI, V, V, V, M, V)],
-    (TRACK, "to_object"): [(M, V, M, F8, M, V)],
     (DEPTH_ERROR, "add_pairs"): [(T, MI, F8, VI, VI, I8, M, M, F8, M4, M4, MI, V, V, V, M, V, M)],
     (DEPTH_ERROR, "add_shares"): [(M4, V, V, V, I8, V)],
     (FREE_SURFACE, "surface_terms"): [(T, MI, M4, M4, MI, V, V, F8, F8, T, M, T, T, V)],
@@ -70,8 +70,8 @@ KERNELS: dict[tuple[str, str], list[tuple[str, ...]]] = {
 """Kernels that Python calls, the slow ones to compile first, with the types that they are called with; what they call
 is compiled with them."""
 CALLS = {
-    TRACK: {SE3}, DEPTH_ERROR: {SE3}, FREE_SURFACE: {SE3}, FLIGHT: {TRACK}, CONSISTENCY: {SE3, TRACK},
-    APPEARANCE: {SE3}, STEPS: {SOLVER},
+    TWIST: {SE3}, TRACK: {SE3, TWIST}, DEPTH_ERROR: {SE3}, FREE_SURFACE: {SE3}, FLIGHT: {TRACK},
+    CONSISTENCY: {SE3, TWIST, TRACK}, APPEARANCE: {SE3}, STEPS: {SOLVER},
 }  # fmt: skip
 """Whose kernels a module's kernels call."""
 

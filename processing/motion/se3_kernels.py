@@ -20,6 +20,20 @@ def inverse(pose):
 
 @no_type_check
 @njit(cache=True, nogil=True)
+def between(a, b):
+    """a @ inverse(b)."""
+    out = np.zeros((4, 4))
+    for i in range(3):
+        out[i, 3] = a[i, 3]
+        for j in range(3):
+            out[i, j] = a[i, 0] * b[j, 0] + a[i, 1] * b[j, 1] + a[i, 2] * b[j, 2]
+            out[i, 3] -= out[i, j] * b[j, 3]
+    out[3, 3] = 1.0
+    return out
+
+
+@no_type_check
+@njit(cache=True, nogil=True)
 def exponential(twist):
     """4x4 of a twist (translation, rotation): the translation is taken as it is."""
     out = np.eye(4)

@@ -2,14 +2,18 @@
 
 H (6, 6; its lower triangle) and g (6) are of a twist (translation, rotation) of the points in a camera's frame: the
 derivative of a point X by it is [1, -[X]x]. Written out entry by entry: the compiler leaves triangular loops as they
-are, and these lines run for every point of every pair of views (a track takes a fifth less time than with loops).
+are, and these lines run for every point of every pair of views (a track takes a fifth less time than with loops). What
+is done once a pair stands in loops all the same: a matrix product this small is mostly its call.
 """
 
 from __future__ import annotations
 
 from typing import no_type_check
 
+import numpy as np
 from numba import njit
+
+from processing.motion.se3_kernels import adjoint
 
 
 @no_type_check
@@ -67,3 +71,61 @@ def add_shading(J, r, weight, K, first, B, N):
             N[first + a, first + b] += ka * K[b]
         for b in range(6):
             B[b, first + a] += ka * J[b]
+
+
+@no_type_check
+@njit(cache=True, error_model="numpy", nogil=True)
+def to_object(H, g, pose, sign, H_out, g_out):
+    """Adds normal equations of a camera frame to those of the object frame: twist_camera = sign * A twist_object.
+
+    pose: 4x4 camera_from_object. H has its lower triangle only.
+    """
+    A, half = adjoint(pose), np.empty((6, 6))
+    for a in range(6):
+        for b in range(6):
+            total = 0.0
+            for c in range(6):
+                total += (H[a, c] if a >= c else H[c, a]) * A[c, b]
+            half[a, b] = total
+    for a in range(6):
+        for b in range(6):
+            total = 0.0
+            for c in range(6):
+                total += A[c, a] * half[c, b]
+            H_out[a, b] += total
+        total = 0.0
+        for c in range(6):
+            total += A[c, a] * g[c]
+        g_out[a] += sign * total
+
+
+@no_type_check
+@njit(cache=True, error_model="numpy", nogil=True)
+def add_depth(Hd, gd, turn_share, H, g):
+    """Adds depth's normal equations (lower triangles): in full as far as a shift of the points answers them, the rest,
+    which is of turns, by `turn_share`.
+
+    Where patches of depth err alike they tilt the surface as a turn would, which every pair shows again, while their
+    mean over the surface is near zero.
+    """
+    least = 1e-6 * (Hd[0, 0] + Hd[1, 1] + Hd[2, 2]) + 1e-12
+    a, b, c, d, e, f = Hd[0, 0] + least, Hd[1, 1] + least, Hd[2, 2] + least, Hd[1, 0], Hd[2, 0], Hd[2, 1]
+    inverse = np.empty((3, 3))
+    inverse[0, 0], inverse[1, 1], inverse[2, 2] = b * c - f * f, a * c - e * e, a * b - d * d
+    inverse[0, 1] = inverse[1, 0] = e * f - c * d
+    inverse[0, 2] = inverse[2, 0] = d * f - b * e
+    inverse[1, 2] = inverse[2, 1] = d * e - a * f
+    inverse /= a * inverse[0, 0] + d * inverse[0, 1] + e * inverse[0, 2]
+    by_shift, shift = np.empty((6, 3)), np.zeros((6, 3))  # shift: the one that looks most like a twist
+    for i in range(6):
+        for j in range(3):
+            by_shift[i, j] = Hd[i, j] if i >= j else Hd[j, i]
+        for j in range(3):
+            for k in range(3):
+                shift[i, j] += by_shift[i, k] * inverse[k, j]
+    for i in range(6):
+        for j in range(i + 1):
+            answered = by_shift[i, 0] * shift[j, 0] + by_shift[i, 1] * shift[j, 1] + by_shift[i, 2] * shift[j, 2]
+            H[i, j] += turn_share * Hd[i, j] + (1.0 - turn_share) * answered
+        answered = shift[i, 0] * gd[0] + shift[i, 1] * gd[1] + shift[i, 2] * gd[2]
+        g[i] += turn_share * gd[i] + (1.0 - turn_share) * answered

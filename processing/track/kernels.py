@@ -11,8 +11,8 @@ from typing import no_type_check
 import numpy as np
 from numba import njit
 
-from processing.motion.se3_kernels import adjoint, exponential, inverse
-from processing.motion.twist_terms import add_image_residuals, add_residual, add_shading
+from processing.motion.se3_kernels import adjoint, between, exponential, inverse
+from processing.motion.twist_terms import add_depth, add_image_residuals, add_residual, add_shading, to_object
 from processing.sensor.view_layout import (
     APPEARANCE,
     COUNT,
@@ -237,30 +237,12 @@ def pair_terms(  # noqa: C901
 
 @no_type_check
 @njit(cache=True, error_model="numpy", nogil=True)
-def to_object(H, g, pose, sign, H_out, g_out):
-    """Adds normal equations of a camera frame to those of the object frame: twist_camera = sign * A twist_object.
-
-    pose: 4x4 camera_from_object. H has its lower triangle only.
-    """
-    A = adjoint(pose)
-    full = np.empty((6, 6))
-    for a in range(6):
-        for b in range(a + 1):
-            full[a, b] = H[a, b]
-            full[b, a] = H[a, b]
-    H_out += A.T @ full @ A
-    g_out += sign * (A.T @ g)
-
-
-@no_type_check
-@njit(cache=True, error_model="numpy", nogil=True)
 def view_terms(pose, view, refs, ref_poses, maps, samples, table, focal, center, row, H, g):
     """Normal equations of one view's pose against reference views, both ways: its points in their images, theirs in
     its image. Returns mean cost, share of points on the surface, share of violations."""
     level = int(row[LEVEL])
     step = max(1, int(np.round(1.0 / row[SHARE])))
     mine = samples[table[view, FIRST] : table[view, FIRST] + table[view, COUNT]]
-    back = inverse(pose)
     cost, seen, on, against = 0.0, 0, 0, 0
     h6, g6 = np.empty((6, 6)), np.empty(6)
     none = np.empty((0, 0))
@@ -269,7 +251,7 @@ def view_terms(pose, view, refs, ref_poses, maps, samples, table, focal, center,
         other = table[refs[k]]
         h6[:], g6[:] = 0.0, 0.0
         c, s, o, v = pair_terms(
-            mine, step, ref_pose @ back, maps, other, focal, center, level, row[GEOMETRY_M], row[INTENSITY],
+            mine, step, between(ref_pose, pose), maps, other, focal, center, level, row[GEOMETRY_M], row[INTENSITY],
             row[OUTLINE_M], row[ROUND] > 0.5, False, h6, g6, h6, g6, none, none,
         )  # fmt: skip
         to_object(h6, g6, ref_pose, 1.0, H, g)
@@ -277,7 +259,7 @@ def view_terms(pose, view, refs, ref_poses, maps, samples, table, focal, center,
         theirs = samples[other[FIRST] : other[FIRST] + other[COUNT]]
         h6[:], g6[:] = 0.0, 0.0
         c, s, o, v = pair_terms(
-            theirs, 2 * step, pose @ inverse(ref_pose), maps, table[view], focal, center, level, row[GEOMETRY_M],
+            theirs, 2 * step, between(pose, ref_pose), maps, table[view], focal, center, level, row[GEOMETRY_M],
             row[INTENSITY], row[OUTLINE_M], row[ROUND] > 0.5, False, h6, g6, h6, g6, none, none,
         )  # fmt: skip
         to_object(h6, g6, pose, -1.0, H, g)
@@ -345,29 +327,6 @@ def shading_terms(pairs):
 
 @no_type_check
 @njit(cache=True, error_model="numpy", nogil=True)
-def _add_depth(Hd, gd, turn_share, H, g):
-    """Adds depth's normal equations (lower triangle): in full as far as a shift of the points answers them, the rest,
-    which is of turns, by `turn_share`.
-
-    Where patches of depth err alike they tilt the surface as a turn would, which every pair shows again, while their
-    mean over the surface is near zero.
-    """
-    full = np.empty((6, 6))
-    for a in range(6):
-        for b in range(a + 1):
-            full[a, b] = Hd[a, b]
-            full[b, a] = Hd[a, b]
-    A = full[:3, :3].copy()
-    least = 1e-6 * (A[0, 0] + A[1, 1] + A[2, 2]) + 1e-12
-    for a in range(3):
-        A[a, a] += least
-    shift = np.linalg.solve(A, np.ascontiguousarray(full[:3]))  # (3, 6): the shift that looks most like a twist
-    H += turn_share * full + (1.0 - turn_share) * (np.ascontiguousarray(full[:, :3]) @ shift)
-    g += turn_share * gd + (1.0 - turn_share) * (np.ascontiguousarray(shift.T) @ gd[:3])
-
-
-@no_type_check
-@njit(cache=True, error_model="numpy", nogil=True)
 def graph_terms(
     poses, pairs, maps, samples, table, focal, center, row, turn_share, shaded, blocks, gradients, crossed, among,
     figures,
@@ -387,10 +346,10 @@ def graph_terms(
         h6[:], g6[:], hd[:], gd[:], b6[:], n6[:] = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         mine = samples[table[i, FIRST] : table[i, FIRST] + table[i, COUNT]]
         c, s, o, v = pair_terms(
-            mine, step, poses[k] @ inverse(poses[i]), maps, table[k], focal, center, level, row[GEOMETRY_M],
+            mine, step, between(poses[k], poses[i]), maps, table[k], focal, center, level, row[GEOMETRY_M],
             row[INTENSITY], row[OUTLINE_M], row[ROUND] > 0.5, shaded, h6, g6, hd, gd, b6, n6,
         )  # fmt: skip
-        _add_depth(hd, gd, turn_share, h6, g6)
+        add_depth(hd, gd, turn_share, h6, g6)
         blocks[m], gradients[m] = 0.0, 0.0
         to_object(h6, g6, poses[k], 1.0, blocks[m], gradients[m])
         if shaded:

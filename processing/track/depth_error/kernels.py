@@ -12,7 +12,7 @@ from typing import no_type_check
 import numpy as np
 from numba import njit
 
-from processing.motion.se3_kernels import adjoint, inverse
+from processing.motion.se3_kernels import adjoint, between
 from processing.sensor.view_layout import (
     APPEARANCE,
     COUNT,
@@ -337,7 +337,7 @@ def add_pairs(
         mine = samples[table[i, FIRST] : table[i, FIRST] + table[i, COUNT]]
         H1[:], g1[:] = 0.0, 0.0
         cost, seen, on, against = pair_terms(
-            mine, step, poses[k] @ inverse(poses[i]), maps, table[k], focal, center, int(row[LEVEL]), row[GEOMETRY_M],
+            mine, step, between(poses[k], poses[i]), maps, table[k], focal, center, int(row[LEVEL]), row[GEOMETRY_M],
             row[INTENSITY], row[OUTLINE_M], side, both_boxes, both, H1, g1,
         )  # fmt: skip
         n = max(1, seen)

@@ -11,7 +11,7 @@ from typing import no_type_check
 import numpy as np
 from numba import njit
 
-from processing.motion.se3_kernels import adjoint, inverse
+from processing.motion.se3_kernels import adjoint, between
 from processing.sensor.view_layout import (
     APPEARANCE,
     COUNT,
@@ -49,7 +49,7 @@ GRAZING = 0.1
 def slide(drawn, pose, samples):
     """Moves a view's samples along their rays to the surface that it showed when it was drawn at `drawn`, and that lies
     where `pose` has it now (to first order: to the planes of the points)."""
-    step = pose @ inverse(drawn)
+    step = between(pose, drawn)
     for i in range(samples.shape[0]):
         p = samples[i]
         x, y, z = p[PX], p[PY], p[PZ]
@@ -158,7 +158,7 @@ def surface_terms(poses, pairs, maps, samples, table, focal, center, reach_m, s_
         h[:], s[:], b[:] = 0.0, 0.0, 0.0
         mine = samples[table[i, FIRST] : table[i, FIRST] + table[i, COUNT]]
         total, seen = _pair_terms(
-            mine, poses[k] @ inverse(poses[i]), maps, table[k], focal, center, reach_m, s_int, h, s, b, N[m]
+            mine, between(poses[k], poses[i]), maps, table[k], focal, center, reach_m, s_int, h, s, b, N[m]
         )
         cost[m] = total / seen if seen > 0 else 1.0
         A = adjoint(poses[k])

@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 
 from processing.motion import se3_kernels as se3
-from processing.motion.twist_terms import add_image_residuals, add_residual
+from processing.motion.twist_terms import add_image_residuals, add_residual, to_object
 from processing.sensor import view_layout as lay
 from processing.track import kernels as k
 
@@ -49,7 +49,7 @@ def consistency_terms(  # noqa: C901 (one hot loop)
     J, H, g = np.empty(6), np.empty((6, 6)), np.empty(6)
     for m in range(pairs.shape[0]):
         i, j = pairs[m, 0], pairs[m, 1]
-        pose = poses[j] @ se3.inverse(poses[i])
+        pose = se3.between(poses[j], poses[i])
         off, u0, v0, w, h = (
             table[j, lay.OFFSET],
             table[j, lay.U0],
@@ -149,4 +149,4 @@ def consistency_terms(  # noqa: C901 (one hot loop)
                     J[0], J[1], J[2] = nx, ny, nz
                     add_residual(J, x, y, z, ahead_m, w_out / (1.0 + r * r / 4.0), H, g)
         blocks[m], gradients[m] = 0.0, 0.0
-        k.to_object(H, g, poses[j], 1.0, blocks[m], gradients[m])
+        to_object(H, g, poses[j], 1.0, blocks[m], gradients[m])

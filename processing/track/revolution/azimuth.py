@@ -17,6 +17,7 @@ from numpy import ndarray as Array
 from scipy.ndimage import minimum_filter1d
 
 from processing.motion import se3_kernels as se3
+from processing.motion.twist_terms import to_object
 from processing.sensor import noise
 from processing.sensor.view_store import ViewStore
 from processing.track import kernels as k
@@ -310,7 +311,7 @@ def standing_terms(
                 store.rectified.focal, store.rectified.center, 0, config.standing_m, NOT_COMPARED, NOT_COMPARED, False,
                 False, h6, g6, h6, g6, *k.NO_SHADING,
             )  # fmt: skip
-            k.to_object(h6, g6, poses[j], 1.0, full, slope)
+            to_object(h6, g6, poses[j], 1.0, full, slope)
             stiff, pull = share * float(axis.twist @ full @ axis.twist), -share * float(axis.twist @ slope)
             H[[i, j], [i, j]] += stiff
             H[[i, j], [j, i]] -= stiff

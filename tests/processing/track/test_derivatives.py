@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from processing.motion import se3_kernels as se3
+from processing.motion.twist_terms import add_depth, to_object
 from processing.sensor import view_layout as lay
 from processing.track import kernels as k
 from processing.track.joint_refinement import Motion, motion_residual
@@ -83,8 +84,19 @@ def depth_terms(turn_share, points, normals, off_m):
     """H, g of depth residuals `off_m` (n) along normals (n, 3) at points (n, 3), as graph_terms adds them."""
     J = np.concatenate([normals, np.cross(points, normals)], axis=1)
     H, g = np.zeros((6, 6)), np.zeros(6)
-    k._add_depth(np.tril(J.T @ J), J.T @ off_m, turn_share, H, g)
-    return H, g, J
+    add_depth(np.tril(J.T @ J), J.T @ off_m, turn_share, H, g)
+    return H + np.tril(H, -1).T, g, J
+
+
+def test_normal_equations_of_the_camera_become_those_of_the_object():
+    """Of residuals J t for the points' twist t in the camera, by the object frame's twist that moves them alike."""
+    rng = np.random.default_rng(3)
+    J, r, pose = rng.normal(size=(20, 6)), rng.normal(size=20), se3.exponential(rng.normal(size=6))
+    H, g = np.zeros((6, 6)), np.zeros(6)
+    to_object(np.tril(J.T @ J), J.T @ r, pose, -1.0, H, g)
+    K = -J @ se3.adjoint(pose)
+    np.testing.assert_allclose(H, K.T @ K, atol=1e-12 * np.abs(H).max())
+    np.testing.assert_allclose(g, K.T @ r, atol=1e-12 * np.abs(g).max())
 
 
 @pytest.fixture
