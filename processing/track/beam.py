@@ -21,7 +21,7 @@ from processing.motion.motion_prior import MotionConfig, change_cost, steady_spi
 from processing.motion.rotation_grid import turn_grid
 from processing.sensor.view_store import ViewStore
 from processing.track import kernels as k
-from processing.track.keyframes import KeyframeConfig, extended, references
+from processing.track.keyframes import KeyframeConfig, Sides, extended
 from processing.track.schedule import Schedule, rows
 
 LEAST_DELAY_S = 0.0003
@@ -360,9 +360,8 @@ def _aligned(
 ) -> Candidate | None:  # fmt: skip
     """One candidate aligned to the nearest views of the model, held to the pose that the motion predicts where it is
     given; None where nothing faces it."""
-    refs = references(
-        h.poses, tuple(j for j in h.keyframes if j != i), h.tracked[-1], pose, scene.center_m, config.keyframes
-    )
+    sides = Sides(h.poses, tuple(j for j in h.keyframes if j != i), h.tracked[-1], scene.center_m)
+    refs = sides.references(pose, config.keyframes)
     if len(refs) == 0:
         return None
     store = scene.store

@@ -65,22 +65,23 @@ def _is_new(
     return bool(poses[view, 2, 3] < config.nearer * depth)
 
 
-def references(
-    poses: Float[Array, "n 4 4"],
-    keyframes: tuple[int, ...],
-    last: int,
-    pose: Float[Array, "4 4"],
-    center_m: Float[Array, "3"],
-    config: KeyframeConfig,
-) -> Int[Array, " m"]:
-    """Views to compare a view at `pose` with: the last one and the keyframes that look from the nearest directions."""
-    views = np.array(sorted({*keyframes, last}))
-    directions = view_directions(poses[views], center_m)
-    here = view_directions(pose[None], center_m)[0]
-    angle = np.degrees(np.arccos(np.clip(directions @ here, -1, 1)))
-    order = np.argsort(angle + 0.05 * rotations_deg(poses[views], pose))
-    order = order[angle[order] < config.co_visible_deg][: config.used]
-    chosen = views[order]
-    if last not in chosen and angle[views == last][0] < config.co_visible_deg:
-        chosen = np.concatenate([chosen[: config.used - 1], [last]])
-    return np.asarray(chosen, dtype=np.int64)
+class Sides:
+    """The keyframes and the last view, by the directions that they look from: which of them a view is compared with."""
+
+    def __init__(
+        self, poses: Float[Array, "n 4 4"], keyframes: tuple[int, ...], last: int, center_m: Float[Array, "3"]
+    ) -> None:
+        self._views = np.array(sorted({*keyframes, last}))
+        self._poses, self._last, self._center_m = poses[self._views], last, center_m
+        self._directions = view_directions(self._poses, center_m)
+
+    def references(self, pose: Float[Array, "4 4"], config: KeyframeConfig) -> Int[Array, " m"]:
+        """Views to compare a view at `pose` with: the last one and those that look from the nearest directions."""
+        here = view_directions(pose[None], self._center_m)[0]
+        angle = np.degrees(np.arccos(np.clip(self._directions @ here, -1, 1)))
+        order = np.argsort(angle + 0.05 * rotations_deg(self._poses, pose))
+        order = order[angle[order] < config.co_visible_deg][: config.used]
+        chosen, last = self._views[order], self._last
+        if last not in chosen and angle[self._views == last][0] < config.co_visible_deg:
+            chosen = np.concatenate([chosen[: config.used - 1], [last]])
+        return np.asarray(chosen, dtype=np.int64)

@@ -7,12 +7,12 @@ colour in them, and a shape without colours has none anywhere.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from numpy import ndarray as Array
 
 from processing.features.sift import relative_motions
@@ -23,7 +23,7 @@ from processing.sensor.rectification import Rectification
 from processing.sensor.view import Crop
 from processing.track import kernels as k
 from processing.track.beam import BeamConfig, Candidate, Hypothesis, Scene, merged
-from processing.track.keyframes import references
+from processing.track.keyframes import Sides
 from processing.track.schedule import Schedule, rows
 from processing.track.windows import WindowConfig, change_costs, pair_costs
 from recordings.errors import BadInput
@@ -45,9 +45,10 @@ class ShapeConfig:
     spread: float = 0.12
     """One that fits worse than the best by more than this is none."""
     seek: Schedule = ((1, 6, 0.015, 0.6, 0.012, 0.12),)
-    searched: int = 32
+    searched: int = 12
     """Frames of a toss (stretches in which nothing moves count as one) in which all orientations are tried, spread
-    evenly; to the others the poses of those beside them are carried."""
+    evenly; to the others the poses of those beside them are carried. With 32, five tosses of choose-002, 003 and 034
+    come out within .2 degrees of where they do with 12, in a fifth to a half more time."""
     unseen: float = 0.1
     """Cost of a point of one frame that the next one does not see: else a body would rather show a new face each time
     than one that has to agree. About what a point costs that fits; from .07 to .2 the paths are alike."""
@@ -143,17 +144,12 @@ class _Painter:
 def located(scene: Scene, view: int, model: ShapeViews, beam: BeamConfig, config: ShapeConfig) -> list[Candidate]:
     """Poses at which the shape fits what one frame shows, best first: from feature matches with the drawn views, and
     from a grid over all orientations. Several, where the shape looks alike from several sides."""
-    n = len(scene.times_s)
-    drawn = np.arange(n, n + len(model.poses))
-    poses = np.concatenate([np.full((n, 4, 4), np.nan), model.poses])
-    tries = [(config.seek, pose) for pose in _grid(scene, view, config)]
-    tries += [(beam.coarse, pose) for pose in _by_features(scene, view, drawn, poses, beam)]
-    tried = sorted((_fitted(scene, view, p, poses, drawn, s, beam) for s, p in tries), key=lambda c: c.cost)
-    rough = merged(tried[: 4 * config.tried], beam)[: config.tried]
-    coarse = merged([_fitted(scene, view, c.pose, poses, drawn, beam.coarse, beam) for c in rough], beam)
-    fine = merged(
-        [_fitted(scene, view, c.pose, poses, drawn, beam.fine, beam) for c in coarse[: 2 * config.starts]], beam
-    )
+    drawn = _Drawn(scene, model, beam)
+    tried = drawn.fitted(view, _grid(scene, view, config), config.seek)
+    tried += drawn.fitted(view, drawn.by_features(view), beam.coarse)
+    rough = merged(sorted(tried, key=lambda c: c.cost)[: 4 * config.tried], beam)[: config.tried]
+    coarse = merged(drawn.fitted(view, [c.pose for c in rough], beam.coarse), beam)
+    fine = merged(drawn.fitted(view, [c.pose for c in coarse[: 2 * config.starts]], beam.fine), beam)
     good = [c for c in fine if c.fit < beam.lost and c.fit < fine[0].fit + config.spread]
     return good[: config.starts]
 
@@ -162,10 +158,10 @@ def path_through(
     scene: Scene, model: ShapeViews, beam: BeamConfig, windows: WindowConfig, config: ShapeConfig,
     report: Callable[[float], None] = lambda _: None,
 ) -> Float[Array, "n 4 4"]:  # fmt: skip
-    """camera_from_object of a toss's frames on a shape: each is located by itself, and the cheapest path through what
-    was found taken (Viterbi) by how the frames fit the shape, what pairs of them say of the motion between them, and
-    its changes. No pose rests on that of the frame before, so that no error is carried on. NaN where nothing fits.
-    `report` is told the share of the work that is done."""
+    """camera_from_object of a toss's frames on a shape: some are located by themselves, what is found is carried to
+    those beside them, and the cheapest path through all of it taken (Viterbi) by how the frames fit the shape, what
+    pairs of them say of the motion between them, and its changes. No pose rests on that of the frame before, so that no
+    error is carried on. NaN where nothing fits. `report` is told the share of the work that is done."""
     n = len(scene.times_s)
     runs = scene.store.still_runs(np.array([scene.store.usable(i) for i in range(n)]))
     found = _everywhere(scene, [run[len(run) // 2] for run in runs], model, beam, config, report)
@@ -183,9 +179,7 @@ def _everywhere(
 ) -> list[list[Candidate]]:  # fmt: skip
     """Poses of each of these frames at which it fits the shape: found there, or beside it and carried on, forward and
     then backward."""
-    n = len(scene.times_s)
-    drawn = np.arange(n, n + len(model.poses))
-    poses = np.concatenate([np.full((n, 4, 4), np.nan), model.poses])
+    drawn = _Drawn(scene, model, beam)
     searched = np.linspace(0, len(views) - 1, min(config.searched, len(views))).astype(int)
     found: list[list[Candidate]] = [[] for _ in views]
     for done, place in enumerate(searched):
@@ -195,8 +189,8 @@ def _everywhere(
     def carry(one: int, other: int) -> None:
         shift = scene.store.center_m[views[other]] - scene.store.center_m[views[one]]
         moved = [_moved(c.pose, shift) for c in found[one]]
-        rough = merged([_fitted(scene, views[other], p, poses, drawn, beam.coarse, beam) for p in moved], beam)
-        fine = [_fitted(scene, views[other], c.pose, poses, drawn, beam.fine, beam) for c in rough]
+        rough = merged(drawn.fitted(views[other], moved, beam.coarse), beam)
+        fine = drawn.fitted(views[other], [c.pose for c in rough], beam.fine)
         every = merged([*found[other], *fine], beam)
         found[other] = [c for c in every if c.fit < min(beam.lost, every[0].fit + config.spread)][: config.starts]
 
@@ -269,28 +263,35 @@ def _grid(scene: Scene, view: int, config: ShapeConfig) -> list[Float[Array, "4 
     return out
 
 
-def _by_features(
-    scene: Scene, view: int, drawn: Int[Array, " m"], poses: Float[Array, "n 4 4"], beam: BeamConfig
-) -> list[Float[Array, "4 4"]]:
-    here = scene.described(view)
-    out = []
-    for j in drawn:
-        for motion in relative_motions(scene.matcher, scene.described(int(j)), here, beam.ransac, seed=int(j), most=1):
-            out.append(motion.other_from_one @ poses[j])
-    return out
+class _Drawn:
+    """The drawn views, for single frames' poses to be aligned to those that look from their side."""
 
+    def __init__(self, scene: Scene, model: ShapeViews, beam: BeamConfig) -> None:
+        n = len(scene.times_s)
+        self._scene, self._beam, self._views = scene, beam, range(n, n + len(model.poses))
+        self._poses = np.concatenate([np.full((n, 4, 4), np.nan), model.poses])
+        self._sides = Sides(self._poses, tuple(self._views), n, scene.center_m)
 
-def _fitted(
-    scene: Scene, view: int, pose: Float[Array, "4 4"], poses: Float[Array, "n 4 4"], drawn: Int[Array, " m"],
-    schedule: Schedule, beam: BeamConfig,
-) -> Candidate:  # fmt: skip
-    """One pose aligned to the drawn views that look from its side."""
-    refs = references(poses, tuple(int(i) for i in drawn), int(drawn[0]), pose, scene.center_m, beam.keyframes)
-    store = scene.store
-    distance = float(np.linalg.norm(store.center_m[view]))
-    aligned, _, fit, on, _ = k.align_view(
-        np.ascontiguousarray(pose), view, refs, np.ascontiguousarray(poses[refs]), store.maps, store.samples,
-        store.table, store.rectified.focal, store.rectified.center, rows(schedule, distance), np.zeros(6), np.eye(4),
-    )  # fmt: skip
-    good = bool(np.isfinite(aligned).all())
-    return Candidate(aligned if good else pose, float(fit) if good else 1.0, 0.0, float(on), "located")
+    def by_features(self, view: int) -> list[Float[Array, "4 4"]]:
+        """Poses that matches of a frame's features with theirs speak for."""
+        scene, here = self._scene, self._scene.described(view)
+        return [
+            motion.other_from_one @ self._poses[j]
+            for j in self._views
+            for motion in relative_motions(scene.matcher, scene.described(j), here, self._beam.ransac, seed=j, most=1)
+        ]
+
+    def fitted(self, view: int, poses: Iterable[Float[Array, "4 4"]], schedule: Schedule) -> list[Candidate]:
+        """Each pose of a frame aligned to the drawn views."""
+        store = self._scene.store
+        row = rows(schedule, float(np.linalg.norm(store.center_m[view])))
+        free, out = (np.zeros(6), np.eye(4)), []
+        for pose in poses:
+            refs = self._sides.references(pose, self._beam.keyframes)
+            aligned, _, fit, on, _ = k.align_view(
+                np.ascontiguousarray(pose), view, refs, np.ascontiguousarray(self._poses[refs]), store.maps,
+                store.samples, store.table, store.rectified.focal, store.rectified.center, row, *free,
+            )  # fmt: skip
+            good = bool(np.isfinite(aligned).all())
+            out.append(Candidate(aligned if good else pose, float(fit) if good else 1.0, 0.0, float(on), "located"))
+        return out

@@ -31,7 +31,7 @@ from processing.track import hypotheses as trajectory
 from processing.track.center_of_mass import flight_center
 from processing.track.flags import camera_covariance
 from processing.track.joint_refinement import GraphConfig, Motion, _add_motion, refine
-from processing.track.keyframes import KeyframeConfig, references
+from processing.track.keyframes import KeyframeConfig, Sides
 from processing.track.registration.keyframe_database import keyframes_of
 from processing.track.registration.register import RegisterConfig, register_tosses
 from processing.track.revolution.axis import Axis
@@ -88,6 +88,8 @@ def test_exponential_and_inverse_meet(twist: np.ndarray) -> None:
     pose = se3.exponential(twist)
     np.testing.assert_allclose(pose @ se3.inverse(pose), np.eye(4), atol=1e-9)
     np.testing.assert_allclose(pose, pose_of(twist), atol=1e-9)
+    other = pose_of(twist[::-1])
+    np.testing.assert_allclose(se3.between(other, pose) @ pose, other, atol=1e-9)
 
 
 def test_depth_of_a_tilted_plane_comes_back_with_its_normal() -> None:
@@ -159,7 +161,7 @@ def test_a_rigid_motion_of_points_is_found(twist: np.ndarray) -> None:
 
 def test_references_look_from_near_directions() -> None:
     poses = np.array([pose_of(np.array([0, 0, 1.0, 0, a, 0])) for a in np.radians([0, 20, 40, 90, 170])])
-    refs = references(poses, (0, 1, 3, 4), 2, poses[1], np.zeros(3), KeyframeConfig(used=3))
+    refs = Sides(poses, (0, 1, 3, 4), 2, np.zeros(3)).references(poses[1], KeyframeConfig(used=3))
     assert set(refs) == {0, 1, 2}
 
 
