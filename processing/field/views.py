@@ -76,20 +76,20 @@ def make_view(
     if colorless is not None and colorless.any():
         foreign = _dilate(_remap(colorless.astype(np.uint8), maps, cv2.INTER_NEAREST) > 0, 1)
     motion = camera_from_object_at_depth @ np.linalg.inv(camera_from_object)
-    seen = depth_m[mask & (depth_m > 0)]
+    seen, moved = depth_m[mask & (depth_m > 0)], np.eye(3)
     if len(seen) and not np.allclose(motion, np.eye(4), atol=1e-6):
         moved = _plane_motion(motion, float(np.median(seen)), camera.K)
-        color_rgb = _warped(color_rgb, moved, cv2.INTER_LINEAR)
-        mask = _warped(mask.astype(np.uint8), moved, cv2.INTER_NEAREST) > 0
-        foreign = None if foreign is None else _warped(foreign.astype(np.uint8), moved, cv2.INTER_NEAREST) > 0
+        mask = _warped(mask.astype(np.uint8), moved, cv2.INTER_NEAREST, _whole(mask)) > 0
         if not mask.any():
             return None
     ys, xs = np.nonzero(mask)
     box = (
-        slice(max(ys.min() - MARGIN_PX, 0), ys.max() + MARGIN_PX + 1),
-        slice(max(xs.min() - MARGIN_PX, 0), xs.max() + MARGIN_PX + 1),
+        slice(max(ys.min() - MARGIN_PX, 0), min(ys.max() + MARGIN_PX + 1, mask.shape[0])),
+        slice(max(xs.min() - MARGIN_PX, 0), min(xs.max() + MARGIN_PX + 1, mask.shape[1])),
     )
-    mask = mask[box]
+    mask, color_rgb = mask[box], _warped(color_rgb, moved, cv2.INTER_LINEAR, box)
+    if foreign is not None:
+        foreign = _warped(foreign.astype(np.uint8), moved, cv2.INTER_NEAREST, box) > 0
     K = camera.K.copy()
     K[0, 2] -= box[1].start
     K[1, 2] -= box[0].start
@@ -99,8 +99,8 @@ def make_view(
         outside, unmasked = outside & open_px, unmasked & open_px
     depth_m, plane = _trusted(np.where(inside, depth_m[box], 0).astype(np.float32), K)
     return FieldView(
-        K, color_rgb[box], depth_m, plane, inside, outside, unmasked, camera_from_object, camera_from_object_at_depth,
-        None if foreign is None else foreign[box],
+        K, color_rgb, depth_m, plane, inside, outside, unmasked, camera_from_object, camera_from_object_at_depth,
+        foreign,
     )  # fmt: skip
 
 
@@ -110,8 +110,18 @@ def _plane_motion(motion: Float[Array, "4 4"], depth_m: float, K: Float[Array, "
     return np.asarray(K @ plane @ np.linalg.inv(K))
 
 
-def _warped(image: Array, homography: Float[Array, "3 3"], how: int) -> Array:
-    return np.asarray(cv2.warpPerspective(image, homography, image.shape[1::-1], flags=how))
+def _warped(image: Array, homography: Float[Array, "3 3"], how: int, box: tuple[slice, slice]) -> Array:
+    """The image moved by a homography, in a box (rows, columns) of it."""
+    rows, columns = box
+    if np.array_equal(homography, np.eye(3)):
+        return image[box]
+    to_box = np.array([[1.0, 0.0, -columns.start], [0.0, 1.0, -rows.start], [0.0, 0.0, 1.0]])
+    size = (int(columns.stop - columns.start), int(rows.stop - rows.start))
+    return np.asarray(cv2.warpPerspective(image, to_box @ homography, size, flags=how))
+
+
+def _whole(image: Array) -> tuple[slice, slice]:
+    return slice(0, image.shape[0]), slice(0, image.shape[1])
 
 
 def object_box(views: Sequence[FieldView], trim: float = 0.002) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
