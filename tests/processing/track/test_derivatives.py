@@ -88,6 +88,11 @@ def depth_terms(turn_share, points, normals, off_m):
     return H + np.tril(H, -1).T, g, J
 
 
+def test_what_is_between_two_poses_leads_from_one_to_the_other():
+    one, other = (se3.exponential(np.random.default_rng(seed).normal(size=6)) for seed in (4, 5))
+    np.testing.assert_allclose(se3.between(other, one) @ one, other, atol=1e-12)
+
+
 def test_normal_equations_of_the_camera_become_those_of_the_object():
     """Of residuals J t for the points' twist t in the camera, by the object frame's twist that moves them alike."""
     rng = np.random.default_rng(3)
