@@ -51,8 +51,8 @@ class FlightConfig:
     """Between the turns tried."""
     rough: Schedule = ((1, 5, 0.012, 0.25, 0.010, 0.12),)
     likely: float = 0.5
-    """Of all spins this share, those that cost least as they are (it holds 47 of 48 solutions of choose-003, 008 and
-    034), on pairs of neighbouring frames ..."""
+    """Of all spins this share, those that cost least as they are (it held 47 of 48 solutions that all spins led to), on
+    pairs of neighbouring frames ..."""
     kept: int = 24
     fine: Schedule = ((1, 6, 0.010, 0.2, 0.010, 0.2), (1, 4, 0.006, 0.15, 0.008, 0.4), (0, 4, 0.004, 0.1, 0.004, 0.5))
     """... and of the best of them, on pairs up to `lags` apart."""
