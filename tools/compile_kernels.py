@@ -70,7 +70,7 @@ KERNELS: dict[tuple[str, str], list[tuple[str, ...]]] = {
 """Kernels that Python calls, the slow ones to compile first, with the types that they are called with; what they call
 is compiled with them."""
 CALLS = {
-    TWIST: {SE3}, TRACK: {SE3, TWIST}, DEPTH_ERROR: {SE3}, FREE_SURFACE: {SE3}, FLIGHT: {TRACK},
+    TWIST: {SE3}, TRACK: {SE3, TWIST}, DEPTH_ERROR: {SE3}, FREE_SURFACE: {SE3}, FLIGHT: {TWIST, TRACK},
     CONSISTENCY: {SE3, TWIST, TRACK}, APPEARANCE: {SE3}, STEPS: {SOLVER},
 }  # fmt: skip
 """Whose kernels a module's kernels call."""

@@ -75,20 +75,21 @@ def add_shading(J, r, weight, K, first, B, N):
 
 @no_type_check
 @njit(cache=True, error_model="numpy", nogil=True)
-def to_object(H, g, pose, sign, H_out, g_out):
-    """Adds normal equations of a camera frame to those of the object frame: twist_camera = sign * A twist_object.
+def add_by_others(H, g, A, weight, weight_g, H_out, g_out):
+    """Adds normal equations of a twist to those of the unknowns that it depends on: twist = A (6, n) unknowns.
 
-    pose: 4x4 camera_from_object. H has its lower triangle only.
+    H (6, 6) has its lower triangle only, H_out (n, n) both; `weight` of H, `weight_g` of g.
     """
-    A, half = adjoint(pose), np.empty((6, 6))
+    n = A.shape[1]
+    half = np.empty((6, n))
     for a in range(6):
-        for b in range(6):
+        for b in range(n):
             total = 0.0
             for c in range(6):
                 total += (H[a, c] if a >= c else H[c, a]) * A[c, b]
-            half[a, b] = total
-    for a in range(6):
-        for b in range(6):
+            half[a, b] = weight * total
+    for a in range(n):
+        for b in range(n):
             total = 0.0
             for c in range(6):
                 total += A[c, a] * half[c, b]
@@ -96,7 +97,17 @@ def to_object(H, g, pose, sign, H_out, g_out):
         total = 0.0
         for c in range(6):
             total += A[c, a] * g[c]
-        g_out[a] += sign * total
+        g_out[a] += weight_g * total
+
+
+@no_type_check
+@njit(cache=True, error_model="numpy", nogil=True)
+def to_object(H, g, pose, sign, H_out, g_out):
+    """Adds normal equations of a camera frame to those of the object frame: twist_camera = sign * A twist_object.
+
+    pose: 4x4 camera_from_object. H has its lower triangle only.
+    """
+    add_by_others(H, g, adjoint(pose), 1.0, sign, H_out, g_out)
 
 
 @no_type_check

@@ -7,6 +7,7 @@ from typing import no_type_check
 import numpy as np
 from numba import njit
 
+from processing.motion.twist_terms import add_by_others
 from processing.track.kernels import STEPS, graph_terms
 
 UNKNOWNS = 9
@@ -28,7 +29,7 @@ def fit_flights(starts, pairs, tau, gravity, maps, samples, table, focal, center
     poses, J = np.zeros((len(tau), 4, 4)), np.zeros((len(tau), 6, UNKNOWNS))
     blocks, gradients = np.zeros((len(pairs), 6, 6)), np.zeros((len(pairs), 6))
     figures = np.zeros((len(pairs), 3))
-    D, half, none = np.empty((6, UNKNOWNS)), np.empty((6, UNKNOWNS)), np.empty((0, 0, 0))
+    none = np.empty((0, 0, 0))
     for c in range(len(starts)):
         x = found[c]
         for level in range(schedule.shape[0]):
@@ -41,7 +42,8 @@ def fit_flights(starts, pairs, tau, gravity, maps, samples, table, focal, center
                 H, g = np.zeros((UNKNOWNS, UNKNOWNS)), np.zeros(UNKNOWNS)
                 for m in range(len(pairs)):
                     sure = 1.0 / (1.0 + (figures[m, 0] / SURE_COST) ** 2)
-                    _add_pair(J[pairs[m, 0]], J[pairs[m, 1]], sure, blocks[m], gradients[m], D, half, H, g)
+                    by_unknowns = J[pairs[m, 0]] - J[pairs[m, 1]]
+                    add_by_others(blocks[m], gradients[m], by_unknowns, sure, sure, H, g)
                 for a in range(UNKNOWNS):
                     H[a, a] += 1e-4 * H[a, a] + 1e-9
                 step = -np.linalg.solve(H, g)
@@ -56,33 +58,6 @@ def fit_flights(starts, pairs, tau, gravity, maps, samples, table, focal, center
                     False, blocks, gradients, none, none, figures)  # fmt: skip
         costs[c] = figures[:, 0].mean()
     return found, costs
-
-
-@no_type_check
-@njit(cache=True, nogil=True)
-def _add_pair(first, second, sure, block, gradient, D, half, H, g):
-    """Adds a pair's normal equations (for the twist of its first view) to those of the unknowns, by which its views'
-    poses change as `first` and `second` say. D, half (6, UNKNOWNS): scratch. Loops: matrices so small cost their calls.
-    """
-    for a in range(6):
-        for b in range(UNKNOWNS):
-            D[a, b] = first[a, b] - second[a, b]
-    for a in range(6):
-        for b in range(UNKNOWNS):
-            total = 0.0
-            for c in range(6):
-                total += block[a, c] * D[c, b]
-            half[a, b] = sure * total
-    for a in range(UNKNOWNS):
-        for b in range(UNKNOWNS):
-            total = 0.0
-            for c in range(6):
-                total += D[c, a] * half[c, b]
-            H[a, b] += total
-        total = 0.0
-        for c in range(6):
-            total += D[c, a] * gradient[c]
-        g[a] += sure * total
 
 
 @no_type_check
