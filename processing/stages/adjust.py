@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float
+from numpy import ndarray as Array
 
 from processing.engine.parts import side_by_side
 from processing.features.sift import Sift
@@ -16,14 +18,15 @@ from processing.run import Run
 from processing.store import Done
 from processing.track.beam import Scene, seconds
 from processing.track.flags import reflagged
-from processing.track.free_surface.adjust import PosedToss, adjusted
+from processing.track.free_surface.adjust import AdjustedToss, PosedToss, adjusted
+from processing.track.hypotheses import HypothesisConfig, open_azimuths
 from processing.track.known_shape import center_of
 from processing.track.track_toss import views_of
 from recordings.geometry import rotation_angle_rad
 from recordings.progress import Silent
 from recordings.results.folder import read_shape, read_track, write_track
 
-VERSION = 8
+VERSION = 9
 
 
 @dataclass(frozen=True)
@@ -56,11 +59,20 @@ def adjust(run: Run, tracks: Mapping[int, Done], shape: Done, images: Mapping[in
         config = run.config.track
         all_after = adjusted(tosses, body, config.hypotheses, run.progress("poses with the surface free"))
         turns, shifts = [], []
-        for track, after in zip(before.values(), all_after, strict=True):
+        for toss, track, after in zip(tosses, before.values(), all_after, strict=True):
             steps = np.linalg.inv(track.camera_from_object[~track.lost]) @ after.poses[~track.lost]
             turns += [float(np.degrees(rotation_angle_rad(step[:3, :3]))) for step in steps]
             shifts += [float(x) for x in np.linalg.norm(steps[:, :3, 3], axis=1)]
-            write_track(folder, reflagged(track, after.poses, after.covariance, after.cost, config.flags))
+            doubt = azimuth_covariance(toss.scene, after, config.hypotheses) if len(tosses) > 1 else None
+            write_track(folder, reflagged(track, after.poses, after.covariance, after.cost, doubt, config.flags))
         return AdjustResult(len(turns), float(np.median(turns or [0.0])), float(np.median(shifts or [0.0])))
 
     return run.store.run("adjust", VERSION, run.config.track, inputs, AdjustResult, compute)
+
+
+def azimuth_covariance(scene: Scene, after: AdjustedToss, config: HypothesisConfig) -> Float[Array, "n 6 6"]:
+    """What the adjusted views of a body that looks round leave open of its azimuth (twist of the object frame); zero of
+    other bodies."""
+    use = np.isfinite(after.cost)
+    found = open_azimuths(scene, after.poses, use, int(use.argmax()), config) if use.any() else None
+    return np.zeros((len(use), 6, 6)) if found is None else found.covariance

@@ -189,15 +189,19 @@ def _status(covariance: Float[Array, "6 6"], config: FlagConfig) -> Status:
 
 def reflagged(
     track: ObjectTrack, poses: Float[Array, "n 4 4"], twists: Float[Array, "n 6 6"], cost: Float[Array, " n"],
-    config: FlagConfig,
+    azimuth: Float[Array, "n 6 6"] | None, config: FlagConfig,
 ) -> ObjectTrack:  # fmt: skip
     """The track at poses that were solved for anew, with their covariances (twist of the object frame) and what each
-    view costs there. Frames that took no part (NaN) or fit nothing are as unsure as they were, and so are unsure ones:
-    one solution about which all are sure knows nothing of the others that left them open."""
+    view costs there. Frames that took no part (NaN) or fit nothing are as unsure as they were. So are unsure ones of a
+    toss that no other one's frames hold (`azimuth` None): one solution knows nothing of the others that left them open.
+    Where others hold it they have decided between those, but for a round body's `azimuth` (its covariance), which no
+    frame tells.
+    """
     status, covariance = list(track.status), track.covariance.copy()
     sure = np.array([s == "tracked" for s in status])
-    for i in np.flatnonzero(sure & (cost <= config.tracked_cost)):
-        covariance[i] = camera_covariance(poses[i], config.correlated * twists[i])
+    for i in np.flatnonzero((sure | (azimuth is not None)) & (cost <= config.tracked_cost)):
+        left = 0.0 if azimuth is None or sure[i] else azimuth[i]
+        covariance[i] = camera_covariance(poses[i], config.correlated * twists[i] + left)
         status[i] = _status(covariance[i], config)
     return replace(track, camera_from_object=poses, covariance=covariance, status=tuple(status))
 

@@ -138,20 +138,28 @@ def _unsure_of_azimuths(
     """A hypothesis of free views, or on a learned shape, of a body that looks round: its views hold the azimuths, but
     wherever they came to lie (what repeats about the axis fits at many, and the shape was learned from such poses), so
     that the uncertainty is that which all frames together leave."""
-    axis = _round_axis(scene, hypothesis, config)
+    poses = hypothesis.joint.poses[: len(scene.times_s)]
+    return replace(hypothesis, azimuths=open_azimuths(scene, poses, hypothesis.use, first, config))
+
+
+def open_azimuths(
+    scene: Scene, poses: Float[Array, "n 4 4"], use: Bool[Array, " n"], first: int, config: HypothesisConfig
+) -> Azimuths | None:
+    """The azimuths of views of a body that looks round, as their poses have them, and what all of them leave open, from
+    the first one on. None where it does not."""
+    axis = _round_axis(scene, poses, use, config)
     if axis is None:
-        return hypothesis
-    poses = hypothesis.joint.poses[: len(scene.times_s)]
-    given = given_azimuths(scene, poses, hypothesis.use, axis, config.azimuth)
-    disagreement = _inconsistency(scene, hypothesis, given, config)
-    return replace(hypothesis, azimuths=with_uncertainty(given, disagreement, first, config.azimuth))
+        return None
+    given = given_azimuths(scene, poses, use, axis, config.azimuth)
+    return with_uncertainty(given, inconsistency(scene, poses, use, given, config.azimuth), first, config.azimuth)
 
 
-def _round_axis(scene: Scene, hypothesis: TrajectoryHypothesis, config: HypothesisConfig) -> Axis | None:
-    """The axis about which its views look round; None where they do not."""
-    poses = hypothesis.joint.poses[: len(scene.times_s)]
-    axis = open_axis(scene, poses, hypothesis.use, config.azimuth.axis)
-    return axis if axis and is_round(scene.store, poses, hypothesis.use, axis, config.body) else None
+def _round_axis(
+    scene: Scene, poses: Float[Array, "n 4 4"], use: Bool[Array, " n"], config: HypothesisConfig
+) -> Axis | None:
+    """The axis about which views look round; None where they do not."""
+    axis = open_axis(scene, poses, use, config.azimuth.axis)
+    return axis if axis and is_round(scene.store, poses, use, axis, config.body) else None
 
 
 def _is_rather_round(
@@ -186,7 +194,7 @@ def _sought(
 ) -> TrajectoryHypothesis | None:
     """A round body's hypothesis with the azimuths that fit all frames together; None where the body is not round."""
     n, best = len(scene.times_s), hypotheses[0]
-    axis = None if len(scene.store) > n else _round_axis(scene, best, config)
+    axis = None if len(scene.store) > n else _round_axis(scene, best.joint.poses[:n], best.use, config)
     if axis is None:
         return None
     easy = replace(config, graph=config.round_body)

@@ -371,8 +371,7 @@ def _as_track(
     lost[first] &= not best.fixed[first]
     twists = config.flags.correlated * joint.covariance[:n]
     if best.azimuths is not None:
-        twist = best.azimuths.axis.twist
-        twists = twists + best.azimuths.sigma_rad[:, None, None] ** 2 * np.outer(twist, twist)
+        twists = twists + best.azimuths.covariance
     for other in hypotheses[1:]:
         apart = other.total - best.total
         twists = twists + uncertainty(joint.poses[:n], other.joint.poses[:n], apart, config.flags)

@@ -120,6 +120,11 @@ class Azimuths:
     axis: Axis
     trust: Trust = Trust()
 
+    @property
+    def covariance(self) -> Float[Array, "n 6 6"]:
+        """Of the poses, by their azimuths alone (twist of the object frame)."""
+        return np.asarray(self.sigma_rad[:, None, None] ** 2 * np.outer(self.axis.twist, self.axis.twist))
+
 
 @dataclass(frozen=True, eq=False)
 class _Frames:

@@ -117,7 +117,7 @@ def test_a_wrong_mask_of_a_frame_or_two_contradicts_no_pose() -> None:
 
 
 def test_poses_that_were_solved_for_anew_are_as_sure_as_their_new_covariances() -> None:
-    """Frames: sure; unsure now; fits nothing; took no part; lost; unsure before."""
+    """Frames: sure; unsure now; fits nothing; took no part; lost; unsure before, until other tosses hold it."""
     config, n = FlagConfig(), 6
     poses = np.tile(np.eye(4), (n, 1, 1))
     poses[4] = np.nan
@@ -131,8 +131,27 @@ def test_poses_that_were_solved_for_anew_are_as_sure_as_their_new_covariances() 
     twists[[0, 1, 2, 5]] = np.diag([1e-3, 2e-3, 3e-3, 0.01, 0.02, 0.03]) ** 2
     twists[1, 3, 3] = 1.0
     cost = np.array([0.1, 0.1, 1.1 * config.tracked_cost, np.nan, np.nan, 0.1])
-    found = reflagged(before, after, twists, cost, config)
+    found = reflagged(before, after, twists, cost, None, config)
     assert found.status == ("tracked", "interpolated", "tracked", "tracked", "lost", "interpolated")
     np.testing.assert_array_equal(found.camera_from_object, after)
     np.testing.assert_allclose(found.covariance[0], camera_covariance(after[0], config.correlated * twists[0]))
     np.testing.assert_array_equal(found.covariance[2:], covariance[2:])
+    held = reflagged(before, after, twists, cost, np.zeros((n, 6, 6)), config)
+    assert held.status == (*found.status[:5], "tracked")
+    np.testing.assert_array_equal(held.covariance[:5], found.covariance[:5])
+    np.testing.assert_allclose(held.covariance[5], camera_covariance(after[5], config.correlated * twists[5]))
+
+
+def test_other_tosses_do_not_decide_about_an_azimuth_that_no_frame_tells() -> None:
+    """Frames: the azimuth known before; open before, and now; open before, known now."""
+    poses, axis = np.tile(np.eye(4), (3, 1, 1)), np.array([0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
+    doubt = np.radians([40.0, 40.0, 2.0])[:, None, None] ** 2 * np.outer(axis, axis)
+    status = ("tracked", "interpolated", "interpolated")
+    before = ObjectTrack(0, "d455", "object", np.arange(3, dtype=np.int64), poses, status, np.tile(doubt[0], (3, 1, 1)))
+    twists = np.tile(np.diag([1e-3] * 3 + [0.01] * 3) ** 2, (3, 1, 1))
+    found = reflagged(before, poses, twists, np.full(3, 0.1), doubt, FlagConfig())
+    assert found.status == ("tracked", "interpolated", "tracked")
+    spread_deg = np.degrees(np.sqrt(found.covariance[:, 2, 2]))
+    assert spread_deg[0] < 2
+    assert spread_deg[1] > 39
+    assert 2 < spread_deg[2] < 3
