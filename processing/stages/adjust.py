@@ -17,7 +17,7 @@ from processing.motion.motion_prior import gravity_in_camera
 from processing.run import Run
 from processing.store import Done
 from processing.track.beam import Scene, seconds
-from processing.track.flags import reflagged
+from processing.track.flags import fit_of_sure, reflagged
 from processing.track.free_surface.adjust import AdjustedToss, PosedToss, adjusted
 from processing.track.hypotheses import HypothesisConfig, open_azimuths
 from processing.track.known_shape import center_of
@@ -26,7 +26,7 @@ from recordings.geometry import rotation_angle_rad
 from recordings.progress import Silent
 from recordings.results.folder import read_shape, read_track, write_track
 
-VERSION = 9
+VERSION = 10
 
 
 @dataclass(frozen=True)
@@ -59,12 +59,13 @@ def adjust(run: Run, tracks: Mapping[int, Done], shape: Done, images: Mapping[in
         config = run.config.track
         all_after = adjusted(tosses, body, config.hypotheses, run.progress("poses with the surface free"))
         turns, shifts = [], []
+        limit = fit_of_sure([*before.values()], [a.cost for a in all_after]) if len(tosses) > 1 else -1.0
         for toss, track, after in zip(tosses, before.values(), all_after, strict=True):
             steps = np.linalg.inv(track.camera_from_object[~track.lost]) @ after.poses[~track.lost]
             turns += [float(np.degrees(rotation_angle_rad(step[:3, :3]))) for step in steps]
             shifts += [float(x) for x in np.linalg.norm(steps[:, :3, 3], axis=1)]
-            doubt = azimuth_covariance(toss.scene, after, config.hypotheses) if len(tosses) > 1 else None
-            write_track(folder, reflagged(track, after.poses, after.covariance, after.cost, doubt, config.flags))
+            held, doubt = after.cost <= limit, azimuth_covariance(toss.scene, after, config.hypotheses)
+            write_track(folder, reflagged(track, after.poses, after.covariance, after.cost, held, doubt, config.flags))
         return AdjustResult(len(turns), float(np.median(turns or [0.0])), float(np.median(shifts or [0.0])))
 
     return run.store.run("adjust", VERSION, run.config.track, inputs, AdjustResult, compute)

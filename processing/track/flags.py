@@ -189,21 +189,27 @@ def _status(covariance: Float[Array, "6 6"], config: FlagConfig) -> Status:
 
 def reflagged(
     track: ObjectTrack, poses: Float[Array, "n 4 4"], twists: Float[Array, "n 6 6"], cost: Float[Array, " n"],
-    azimuth: Float[Array, "n 6 6"] | None, config: FlagConfig,
+    held: Bool[Array, " n"], azimuth: Float[Array, "n 6 6"], config: FlagConfig,
 ) -> ObjectTrack:  # fmt: skip
     """The track at poses that were solved for anew, with their covariances (twist of the object frame) and what each
-    view costs there. Frames that took no part (NaN) or fit nothing are as unsure as they were. So are unsure ones of a
-    toss that no other one's frames hold (`azimuth` None): one solution knows nothing of the others that left them open.
-    Where others hold it they have decided between those, but for a round body's `azimuth` (its covariance), which no
-    frame tells.
+    view costs there. Frames that took no part (NaN) or fit nothing are as unsure as they were. So are unsure ones that
+    no other toss's frames have `held`: one solution knows nothing of the others that left them open. Those that are
+    held keep the doubt about a round body's `azimuth` (its covariance), which no frame tells.
     """
     status, covariance = list(track.status), track.covariance.copy()
     sure = np.array([s == "tracked" for s in status])
-    for i in np.flatnonzero((sure | (azimuth is not None)) & (cost <= config.tracked_cost)):
-        left = 0.0 if azimuth is None or sure[i] else azimuth[i]
+    for i in np.flatnonzero((sure | held) & (cost <= config.tracked_cost)):
+        left = 0.0 if sure[i] else azimuth[i]
         covariance[i] = camera_covariance(poses[i], config.correlated * twists[i] + left)
         status[i] = _status(covariance[i], config)
     return replace(track, camera_from_object=poses, covariance=covariance, status=tuple(status))
+
+
+def fit_of_sure(tracks: Sequence[ObjectTrack], costs: Sequence[Float[Array, " n"]]) -> float:
+    """What the worst of all tosses' sure frames costs (-1: none is sure): others that fit as well lie where they say.
+    At an impact, where a pose is but put between its neighbours, a frame costs several times as much."""
+    sure = [cost[[s == "tracked" for s in track.status]] for track, cost in zip(tracks, costs, strict=True)]
+    return float(np.nanmax(np.concatenate([*sure, [-1.0]])))
 
 
 def _in_gap(

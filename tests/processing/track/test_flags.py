@@ -14,6 +14,7 @@ from processing.track.flags import (
     FlagConfig,
     camera_covariance,
     contradicting,
+    fit_of_sure,
     reflagged,
     unjoined,
     unjoined_uncertainty,
@@ -130,13 +131,13 @@ def test_poses_that_were_solved_for_anew_are_as_sure_as_their_new_covariances() 
     twists = np.full((n, 6, 6), np.nan)
     twists[[0, 1, 2, 5]] = np.diag([1e-3, 2e-3, 3e-3, 0.01, 0.02, 0.03]) ** 2
     twists[1, 3, 3] = 1.0
-    cost = np.array([0.1, 0.1, 1.1 * config.tracked_cost, np.nan, np.nan, 0.1])
-    found = reflagged(before, after, twists, cost, None, config)
+    cost, nothing = np.array([0.1, 0.1, 1.1 * config.tracked_cost, np.nan, np.nan, 0.1]), np.zeros((n, 6, 6))
+    found = reflagged(before, after, twists, cost, np.zeros(n, dtype=bool), nothing, config)
     assert found.status == ("tracked", "interpolated", "tracked", "tracked", "lost", "interpolated")
     np.testing.assert_array_equal(found.camera_from_object, after)
     np.testing.assert_allclose(found.covariance[0], camera_covariance(after[0], config.correlated * twists[0]))
     np.testing.assert_array_equal(found.covariance[2:], covariance[2:])
-    held = reflagged(before, after, twists, cost, np.zeros((n, 6, 6)), config)
+    held = reflagged(before, after, twists, cost, np.ones(n, dtype=bool), nothing, config)
     assert held.status == (*found.status[:5], "tracked")
     np.testing.assert_array_equal(held.covariance[:5], found.covariance[:5])
     np.testing.assert_allclose(held.covariance[5], camera_covariance(after[5], config.correlated * twists[5]))
@@ -149,9 +150,20 @@ def test_other_tosses_do_not_decide_about_an_azimuth_that_no_frame_tells() -> No
     status = ("tracked", "interpolated", "interpolated")
     before = ObjectTrack(0, "d455", "object", np.arange(3, dtype=np.int64), poses, status, np.tile(doubt[0], (3, 1, 1)))
     twists = np.tile(np.diag([1e-3] * 3 + [0.01] * 3) ** 2, (3, 1, 1))
-    found = reflagged(before, poses, twists, np.full(3, 0.1), doubt, FlagConfig())
+    found = reflagged(before, poses, twists, np.full(3, 0.1), np.ones(3, dtype=bool), doubt, FlagConfig())
     assert found.status == ("tracked", "interpolated", "tracked")
     spread_deg = np.degrees(np.sqrt(found.covariance[:, 2, 2]))
     assert spread_deg[0] < 2
     assert spread_deg[1] > 39
     assert 2 < spread_deg[2] < 3
+
+
+def test_what_sure_frames_cost_is_the_most_that_other_ones_may() -> None:
+    """Two tosses: sure, sure without a part in the solution, unsure; unsure only."""
+    pose, covariance = np.tile(np.eye(4), (3, 1, 1)), np.zeros((3, 6, 6))
+    times = np.arange(3, dtype=np.int64)
+    one = ObjectTrack(0, "d455", "object", times, pose, ("tracked", "tracked", "interpolated"), covariance)
+    other = ObjectTrack(1, "d455", "object", times, pose, ("interpolated",) * 3, covariance)
+    costs = [np.array([0.05, np.nan, 0.2]), np.array([0.3, 0.1, np.nan])]
+    assert fit_of_sure([one, other], costs) == 0.05
+    assert fit_of_sure([other], costs[1:]) == -1.0
