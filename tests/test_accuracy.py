@@ -43,7 +43,8 @@ def add_auc(camera_from_object, camera_from_true, points_m):
     return 100 * np.clip(1 - np.nan_to_num(error_m, nan=np.inf) / ADD_LIMIT_M, 0, 1).mean()
 
 
-@pytest.mark.parametrize("name", ["photo_dev/truck", pytest.param("lab_dev", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["photo_dev/truck", "lab_dev"])
 def test_one_toss_of_a_known_object_is_tracked_as_well_as_its_figure(name, data, tmp_path):
     truth = data(name.replace("_dev", "_dev_truth"))
     import_folder(data(name), tmp_path / "session")

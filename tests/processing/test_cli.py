@@ -241,6 +241,7 @@ def test_the_baseline_gives_its_own_row(record_tiny: Record, capsys: pytest.Capt
     assert "no registration between tosses" in err
 
 
+@pytest.mark.slow
 def test_scope_one_gives_every_toss_its_own_shape(record_tiny: Record, capsys: pytest.CaptureFixture[str]) -> None:
     session = record_tiny()
     answers(capsys, session, "--scope", "one", "--variant", "bundlesdf-1")

@@ -281,6 +281,7 @@ def test_the_second_pass_leaves_a_lost_toss_as_it_was_and_judges_the_others(one_
     assert "lost" not in verdicts["toss_00"]
 
 
+@pytest.mark.slow
 def test_a_disk_full_in_the_second_pass_is_one_message_and_keeps_all_before_it(
     two_objects: tuple[Path, Results],
     tmp_path: Path,

@@ -123,6 +123,7 @@ def test_a_shape_one_millimetre_larger_all_round_is_no_evidence_because_the_plan
     assert sum(after.values()) < 1.2 * sum(before.values())
 
 
+@pytest.mark.slow
 def test_what_judges_a_toss_is_the_same_whatever_that_toss_did(
     run: Run, true_tracks: dict[int, Done], true_shape: Done, halves: tuple[Half, ...]
 ) -> None:

@@ -104,9 +104,8 @@ def processed(session: Path) -> tuple[Results, list[int]]:
     return Results.open(session / "results"), [s["counts"]["frames"] for s in stages]
 
 
-@pytest.mark.parametrize(
-    "position", [11, pytest.param(0, marks=pytest.mark.slow), pytest.param(6, marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("position", [11, 0, 6])
 def test_waiting_three_hundred_frames_costs_a_few_and_leaves_every_frame_a_pose(
     tiny_world: Any, tmp_path: Path, position: int
 ) -> None:

@@ -198,6 +198,7 @@ def test_what_does_not_fit_together_is_refused_in_words(tiny_world: Any, toss: T
         followed(tiny_world, (toss[0], hidden), start=start, start_frame=0)
 
 
+@pytest.mark.slow
 def test_a_toss_is_placed_in_the_frame_of_a_known_shape(tiny_world: Any, toss: Toss, shape: Any) -> None:
     alone = followed(tiny_world, toss)
     placed = register_tosses([alone], model=shape)
