@@ -1,25 +1,24 @@
 """The intervals of contact learning: what the model leaves is fitted on one half of the bodies or tosses, and how often
 the intervals hold the truth is counted on the other half.
 
-python tools/bench_intervals.py [one] [fast] [slow] [few]      # all by default
+python tools/bench_intervals.py [one] [fast] [slow]      # all by default
 
 `one`: single real tosses (TOSSLAB_DATA/contactnets/tosses_processed), each recording once; numbers below 200 fit, the
-others judge. `fast` (148 Hz, bootstrap) and `slow` (30 Hz, forecasts): simulated bodies of any kind; every second four
-of them fit. `few`: the same at 30 Hz from one and two tosses, by forecasts and by the loss. One thread; `one` takes 200
-CPU seconds, the others up to half a minute a body.
+others judge. `fast` (148 Hz, bootstrap): simulated bodies of any kind; every second four of them fit. `slow`: the same
+at 30 Hz, from one toss, two, three and ten: friction and restitution by forecasts, of either half of the bodies, and
+friction by the loss. One thread; `one` takes 200 CPU seconds, the others up to a minute a body.
 """
 
 from __future__ import annotations
 
 import sys
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from bench_contact import CUBE, any_body, held, line, noisy, recorded_once, run_cases, simulated, toss
 
-from processing.contact.friction import estimate as slow_friction
+from processing.contact.friction.estimate import Interval
 from processing.contact.learn import intervals
 from processing.contact.learn.learn import ContactConfig, ContactLearning, learn_contact
 from processing.contact.learn.prior import Prior, prior_from_size
@@ -128,74 +127,60 @@ def made_body(seed: int, every: int) -> MadeBody:
     return MadeBody(what, tracks, prior, physics, mu, rebound)
 
 
-def learned_body(seed: int, every: int) -> tuple[ContactLearning, float, float]:
-    """A simulated body learned from ten tosses, its true friction and its restitution."""
-    body = made_body(seed, every)
-    began = time.process_time()
-    found = body.learned(every=every)
-    f = found.friction
-    law = (
-        "" if found.restitution is None else f"; restitution {found.restitution.value:.2f}, true {body.restitution:.2f}"
-    )
-    line(
-        f"body {seed}",
-        f"{body.what}: friction {f.value:.3f} ({f.low:.3f} .. {f.high:.3f}), true {body.friction:.3f}{law}; "
-        f"{time.process_time() - began:.1f} CPU-s",
-    )
-    return found, body.friction, body.restitution
-
-
-def few() -> None:
-    """Friction at 30 Hz from one and two tosses, by forecasts and by the loss."""
-    ratios: dict[tuple[int, bool], list[float]] = {}
-    held_by: dict[tuple[int, bool], list[bool]] = {}
-    for seed in range(BODIES):
-        body = made_body(seed, 5)
-        for tosses in ((0,), (1,), (2,), (3, 4), (5, 6)):
-            for forecasts in (True, False):
-                try:
-                    f = body.learned(tosses, forecasts=forecasts).friction
-                except BadInput:  # a box whose size one toss does not tell
-                    continue
-                of = (len(tosses), forecasts)
-                ratios.setdefault(of, []).append(max(f.value, 0.01) / body.friction)
-                held_by.setdefault(of, []).append(f.low <= body.friction <= f.high)
-    for (tosses, forecasts), found in sorted(ratios.items()):
-        off, inside = np.abs(1 / np.array(found) - 1), np.mean(held_by[tosses, forecasts])
-        line(
-            f"{tosses} tosses, {'forecasts' if forecasts else 'loss'}",
-            f"{len(found)} fits: median of estimate / truth {np.median(found):.2f}, rms of its log "
-            f"{np.sqrt(np.mean(np.log(found) ** 2)):.2f}; 95 % of |truth / estimate - 1| below "
-            f"{np.quantile(off, 0.95, method='higher'):.2f}; inside the interval {100 * inside:.0f} %",
-        )
-
-
-def bodies(every: int) -> None:
-    """Simulated bodies at 148 Hz / every: friction relative to itself, and restitution where it is learned."""
-    share = intervals.MODEL_SHARE if every == 1 else slow_friction.MODEL_SHARE
+def fast() -> None:
+    """Friction at 148 Hz, relative to itself."""
     friction: dict[bool, list[Reading]] = {True: [], False: []}
-    rebounds: dict[bool, list[Reading]] = {True: [], False: []}
     for seed in range(BODIES):
-        half = seed // 4 % 2 == 0
+        body = made_body(seed, 1)
         try:
-            found, mu, rebound = learned_body(seed, every)
+            f = body.learned(every=1).friction
         except BadInput as wrong:
             line(f"body {seed}", f"refused: {wrong}")
             continue
-        value = found.friction.value
-        friction[half].append(Reading(value, mu, without(found.spread.friction, share * value), value))
-        if found.restitution is not None:
-            e = found.restitution
-            left = without(e.high - e.value, slow_friction.MODEL_RESTITUTION)
-            rebounds[half].append(Reading(e.value, rebound, left))
-    name = "148 Hz" if every == 1 else "30 Hz"
-    told(f"{name}, friction", friction[True], friction[False], share)
-    if rebounds[True]:
-        told(f"{name}, restitution", rebounds[True], rebounds[False], slow_friction.MODEL_RESTITUTION)
+        line(f"body {seed}", f"{body.what}: friction {of(f)}, true {body.friction:.3f}")
+        left = without(f.high - f.value, intervals.MODEL_SHARE * f.value)
+        friction[seed // 4 % 2 == 0].append(Reading(f.value, body.friction, left, f.value))
+    told("148 Hz, friction", friction[True], friction[False], intervals.MODEL_SHARE)
 
 
-CASES = {"one": one, "fast": lambda: bodies(1), "slow": lambda: bodies(5), "few": few}
+def of(interval: Interval) -> str:
+    return f"{interval.value:.3f} ({interval.low:.3f} .. {interval.high:.3f})"
+
+
+TOLD = ("friction by forecasts", "friction by the loss", "restitution")
+
+
+def slow() -> None:
+    """Friction and restitution at 30 Hz from few tosses and from ten."""
+    found: dict[tuple[int, str, bool], list[tuple[Interval, float]]] = {}
+    for seed in range(BODIES):
+        body, half = made_body(seed, 5), seed // 4 % 2 == 0
+        for tosses in ((0,), (1,), (3, 4), (6, 7, 8), tuple(range(10))):
+            for forecasts in (True, False):
+                try:
+                    learned = body.learned(tosses, forecasts=forecasts)
+                except BadInput:  # a box whose size one toss does not tell
+                    continue
+                found.setdefault((len(tosses), TOLD[not forecasts], half), []).append((learned.friction, body.friction))
+                if learned.restitution is not None:
+                    readings = found.setdefault((len(tosses), TOLD[2], half), [])
+                    readings.append((learned.restitution, body.restitution))
+    for (tosses, what, half), pairs in sorted(found.items()):
+        inside = np.mean([x.low <= truth <= x.high for x, truth in pairs])
+        width = float(np.median([x.high - x.low for x, _ in pairs]))
+        off = np.array([x.value - truth for x, truth in pairs])
+        if what != TOLD[2]:
+            off = np.log([max(x.value, 0.01) / truth for x, truth in pairs])
+        line(
+            f"{tosses} tosses, {what}, {'even' if half else 'odd'} fours",
+            f"{len(pairs)} fits: inside {100 * inside:.0f} %, median width {width:.2f}; "
+            f"{'estimate - truth' if what == TOLD[2] else 'log of estimate / truth'} {off.mean():+.2f}, rms "
+            f"{np.sqrt(np.mean(off**2)):.2f}",
+        )
+
+
+CASES = {"one": one, "fast": fast, "slow": slow}
 
 
 if __name__ == "__main__":
-    sys.exit(run_cases(CASES, without_data=("fast", "slow", "few")))
+    sys.exit(run_cases(CASES, without_data=("fast", "slow")))

@@ -9,7 +9,6 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray as Array
 
-from processing.contact.friction.estimate import ENOUGH_TOSSES
 from processing.live.friction import LawSoFar, shrink_by
 from processing.live.sides import Start, TossSides, next_starts, surface_sigma_m
 from recordings.geometry import Transform
@@ -53,7 +52,7 @@ def options(
     if law is not None:
         found += [_like(t, law, throws) for t in law.information if t in throws]
     elif world_from_camera is not None and sides:
-        found += _until_friction(throws)
+        found.append(Option("a toss that flies, hits the table and comes to rest: only such tell friction", 0.0))
     return sorted(found, key=lambda o: -o.shrink)
 
 
@@ -90,12 +89,3 @@ def _differs(toss: int, throws: Mapping[int, Throw]) -> str:
     if abs(own.fall_m - fall) > ALIKE * max(fall, 0.01):
         words.append("higher" if own.fall_m > fall else "lower")
     return f" ({', '.join(words)})" if words else ""
-
-
-def _until_friction(throws: Mapping[int, Throw]) -> list[Option]:
-    missing = ENOUGH_TOSSES - len(throws)
-    if missing <= 0:
-        return []
-    need = f"fewer than {ENOUGH_TOSSES} hardly tell friction"
-    text = f"{missing} more that fly, hit the table and come to rest: {need}"
-    return [Option(text, 0.0)]

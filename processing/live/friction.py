@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from processing.contact.friction.estimate import (
-    ENOUGH_TOSSES,
-    PROFILE,
+    FRICTIONS,
     RESTITUTION_ASSUMED,
+    Interval,
     friction_by_forecasts,
     observed_trajectories,
 )
@@ -35,39 +35,36 @@ CONTACTS, POINTS = 6, 24
 
 @dataclass(frozen=True)
 class LawSoFar:
-    """Friction and restitution with half their 95 % intervals; `information` on friction by toss: the curvature of its
-    score over log friction, nothing where it said nothing."""
+    """Friction and restitution; `information` on friction by toss: the curvature of its score over log friction,
+    nothing where it said nothing."""
 
-    friction: float
-    friction_half: float
-    restitution: float
-    restitution_half: float
+    friction: Interval
+    restitution: Interval
     information: Mapping[int, float]
 
     def text(self) -> str:
         """With 95 % intervals."""
-        low, high = (max(self.friction + s * self.friction_half, 0.0) for s in (-1, 1))
-        bounce = [float(np.clip(self.restitution + s * self.restitution_half, 0.0, 1.0)) for s in (-1, 1)]
+        f, e = self.friction, self.restitution
         return (
-            f"friction {self.friction:.2f} ({low:.2f} to {high:.2f}), restitution {self.restitution:.2f} "
-            f"({bounce[0]:.2f} to {bounce[1]:.2f}; {RESTITUTION_ASSUMED})"
+            f"friction {f.value:.2f} ({f.low:.2f} to {f.high:.2f}), restitution {e.value:.2f} "
+            f"({e.low:.2f} to {e.high:.2f}; {RESTITUTION_ASSUMED})"
         )
 
 
 def law_so_far(
     tracks: Mapping[int, ObjectTrack], shape: ObjectShape, world_from_camera: Transform, calibration: RigCalibration
 ) -> LawSoFar | None:
-    """From tracks in the shape's object frame; None where too few of them hit the table."""
+    """From tracks in the shape's object frame; None where none of them hits the table."""
     body, series, smoothed = _prepared(tracks, shape, world_from_camera, calibration)
     hit = [s.toss for s, m in zip(series, smoothed) if observed_trajectories([s], [m])]
-    found = friction_by_forecasts(body, series, smoothed) if len(hit) >= ENOUGH_TOSSES else None
+    found = friction_by_forecasts(body, series, smoothed)
     if found is None:
         return None
-    step = float(PROFILE[1] - PROFILE[0])
-    middle = int(np.abs(PROFILE).argmin())
-    bend = np.diff(found.profile, 2, axis=0)[max(middle - 2, 0) : middle + 1].mean(0) / step**2
+    bends = np.diff(found.scores, 2, axis=0)
+    nearest = int(np.abs(np.log(FRICTIONS[1:-1] / found.friction.value)).argmin())
+    bend = bends[max(nearest - 1, 0) : nearest + 2].mean(0)
     information = {t: max(float(b), 0.0) for t, b in zip(hit, bend)} if len(hit) == len(bend) else {}
-    return LawSoFar(found.value, found.half_width, found.law.restitution, found.restitution_half_width, information)
+    return LawSoFar(found.friction, found.restitution, information)
 
 
 def _prepared(

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray as Array
 
-from processing.contact.friction.estimate import lowest, noise_of, observed_trajectories
+from processing.contact.friction.estimate import noise_of, observed_trajectories
 from processing.contact.friction.forecast import Forecasts, Law, RigidBody
 from processing.contact.learn.data_checks import lowest_point_m
 from processing.contact.learn.touch import TouchedPlane
@@ -52,6 +52,16 @@ def plane_by_forecasts(
     spread = float(np.std([lowest(HEIGHTS_M, scores @ counts) for counts in drawn], ddof=1))
     std_m = float(np.hypot(spread * (n / (n - 1)) ** 0.5, MODEL_STD_M))
     return TouchedPlane(lowest(HEIGHTS_M, scores.sum(1)), std_m, float(n))
+
+
+def lowest(x: Float[Array, " f"], y: Float[Array, " f"]) -> float:
+    """Where a curve on an even grid is lowest: the parabola through the least entry and its neighbours."""
+    i = int(np.clip(y.argmin(), 1, len(y) - 2))
+    before, here, after = y[i - 1 : i + 2]
+    bend = before + after - 2 * here
+    if bend <= 0:
+        return float(x[y.argmin()])
+    return float(x[i] + (x[i + 1] - x[i]) * np.clip(0.5 * (before - after) / bend, -1, 1))
 
 
 def _larger(corners_m: Float[Array, "8 3"], by_m: float) -> Float[Array, "8 3"]:

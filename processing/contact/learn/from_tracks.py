@@ -19,7 +19,6 @@ from processing.contact.learn.learn import (
     ContactConfig,
     ContactLearning,
     learn_contact,
-    restitution_of,
     results_of,
     slow_friction,
     with_friction,
@@ -240,18 +239,21 @@ def _fused(
     slow = slow_friction(model, found.parameters, learning.prepared, contact_config)
     found, spread = with_friction(found, learning.spread, slow, learning.prepared, contact_config)
     moved = replace(prior, geometry=model.geometry)
-    contact, _, friction, sizes = results_of(model, found.parameters, spread, moved, physics, plane, learning.touched)
+    contact, _, friction, sizes = results_of(
+        model, found.parameters, spread, slow, moved, physics, plane, learning.touched
+    )
     return replace(
         learning,
         model=contact,
         shape=_support_mesh(contact, learning.touched),
         friction=friction,
         extents=sizes,
+        spread=spread,
         fit=found,
         fitted=model,
         solver_failures=learning.solver_failures + found.last_failures,
         law=None if slow is None else slow.law,
-        restitution=restitution_of(slow),
+        restitution=None if slow is None else slow.restitution,
     )
 
 

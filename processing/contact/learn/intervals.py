@@ -42,18 +42,6 @@ the world (a rebound, several contacts in one step). Set after three simulated s
 fast fits it on one half of many bodies and reports on the other."""
 
 
-@dataclass(frozen=True)
-class Interval:
-    """A number with its 95 % interval."""
-
-    value: float
-    low: float
-    high: float
-
-    def to_json(self) -> dict[str, float]:
-        return {"value": self.value, "low": self.low, "high": self.high}
-
-
 @dataclass(frozen=True, eq=False)
 class Spread:
     """95 % half widths: of friction, of the extents along the axes, of each point, and by which method."""

@@ -11,13 +11,13 @@ import torch
 from jaxtyping import Bool, Float
 from numpy import ndarray as Array
 
-from processing.contact.friction.estimate import ForecastFriction, frames_are_slow, friction_by_forecasts
+from processing.contact.friction.estimate import ForecastFriction, Interval, frames_are_slow, friction_by_forecasts
 from processing.contact.friction.forecast import Law, RigidBody
 from processing.contact.friction.plane_forecast import plane_by_forecasts
 from processing.contact.learn import data_checks as checks
 from processing.contact.learn.dissipation_weight import HeldOut, Sweep, SweepConfig, sweep_weights
 from processing.contact.learn.fit import FRICTION, Fit, FitConfig, Model, fit
-from processing.contact.learn.intervals import Interval, Spread, bootstrap, curvature, extents, plane_sensitivity
+from processing.contact.learn.intervals import Spread, bootstrap, curvature, extents, plane_sensitivity
 from processing.contact.learn.prepared import Prepared, no_contact, prepare, starts, transitions
 from processing.contact.learn.prior import Frame, Prior, learned_shape
 from processing.contact.learn.touch import plane_by_touch
@@ -32,7 +32,7 @@ from recordings.tracks import ContactModel, ObjectShape
 
 LOSS_WHEN_SLOW = 0.35
 """Half the 95 % interval of the loss's friction where frames are too far apart for it: the 95 % quantile of its error
-in 85 single tosses of simulated bodies (tools/bench_intervals.py few)."""
+in 85 single tosses of simulated bodies (tools/bench_intervals.py slow)."""
 
 
 @dataclass(frozen=True)
@@ -150,7 +150,7 @@ def learn_contact(
     body = fitted.numbers(optimum)
     touched = touched_points(fitted, body, data, weights)
     checks.check_plane(_rest_heights(prepared, body.points_m.cpu().numpy()), "the learned shape")
-    model, shape, friction, sizes = results_of(fitted, optimum, spread, prior, physics, plane, touched)
+    model, shape, friction, sizes = results_of(fitted, optimum, spread, slow, prior, physics, plane, touched)
     left_out = {**prepared.left_out, **dict.fromkeys(sorted(again), "the same recording as another toss")}
     progress.step(6, 6, "learned")
     return ContactLearning(
@@ -180,7 +180,7 @@ def learn_contact(
         cpu_seconds=cpu_seconds,
         seconds=time.perf_counter() - began,
         law=None if slow is None else slow.law,
-        restitution=restitution_of(slow),
+        restitution=None if slow is None else slow.restitution,
     )
 
 
@@ -256,15 +256,7 @@ def slow_friction(
     """The friction by forecasts where it is better than the loss's; None where it is not, or not asked for."""
     if not forecasts_are_wanted(prepared, config):
         return None
-    return friction_by_forecasts(_as_rigid(fitted, optimum), prepared.tracks, prepared.smoothed, config.seed)
-
-
-def restitution_of(slow: ForecastFriction | None) -> Interval | None:
-    """The restitution with its interval, where friction was found by forecasts."""
-    if slow is None:
-        return None
-    value, half = slow.law.restitution, slow.restitution_half_width
-    return Interval(value, max(value - half, 0.0), min(value + half, 1.0))
+    return friction_by_forecasts(_as_rigid(fitted, optimum), prepared.tracks, prepared.smoothed)
 
 
 def _as_rigid(fitted: Model, optimum: Float[Array, " p"]) -> RigidBody:
@@ -295,15 +287,14 @@ def _slow_plane(
 def with_friction(
     done: Fit, spread: Spread, slow: ForecastFriction | None, prepared: Prepared, config: ContactConfig
 ) -> tuple[Fit, Spread]:
-    """A fit and its intervals with the friction by forecasts, where there is one. Where it was wanted and no toss flies
-    and hits the plane, the loss's friction stays, and may be far off."""
+    """A fit with the friction by forecasts, where there is one, and the intervals' method. Where it was wanted and no
+    toss flies and hits the plane, the loss's friction stays, and may be far off."""
     if slow is None:
         wanted = forecasts_are_wanted(prepared, config)
         return done, replace(spread, friction=max(spread.friction, LOSS_WHEN_SLOW)) if wanted else spread
     parameters = done.parameters.copy()
-    parameters[FRICTION] = slow.value**0.5
-    method = f"{spread.method}; friction by forecasts"
-    return replace(done, parameters=parameters), replace(spread, method=method, friction=slow.half_width)
+    parameters[FRICTION] = slow.friction.value**0.5
+    return replace(done, parameters=parameters), replace(spread, method=f"{spread.method}; friction by forecasts")
 
 
 def touched_points(fitted: Model, body: Body, data: StepData, weights: Weights) -> Bool[Array, " v"]:
@@ -330,6 +321,7 @@ def results_of(
     fitted: Model,
     optimum: Float[Array, " p"],
     spread: Spread,
+    slow: ForecastFriction | None,
     prior: Prior,
     physics: Physics,
     plane: Plane,
@@ -339,7 +331,7 @@ def results_of(
     body = fitted.numbers(optimum)
     points = body.points_m.cpu().numpy()
     mu = float(body.friction)
-    friction = Interval(mu, max(mu - spread.friction, 0.0), mu + spread.friction)
+    friction = Interval(mu, max(mu - spread.friction, 0.0), mu + spread.friction) if slow is None else slow.friction
     sizes = tuple(
         Interval(float(x), float(max(x - w, 0.0)), float(x + w)) for x, w in zip(extents(points), spread.extents_m)
     )

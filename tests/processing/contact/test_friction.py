@@ -4,7 +4,14 @@ import numba
 import numpy as np
 import pytest
 
-from processing.contact.friction.estimate import FEW_TOSSES, best_law, frames_are_slow, friction_by_forecasts
+from processing.contact.friction.estimate import (
+    PRIOR_LOG_SIGMA,
+    PRIOR_MEDIAN,
+    frames_are_slow,
+    friction_by_forecasts,
+    marginal,
+    posterior,
+)
 from processing.contact.friction.forecast import MEMBERS, Forecasts, Law, ObservedTrajectory, RigidBody
 from processing.contact.learn.fit import Fit
 from processing.contact.learn.intervals import Spread
@@ -40,8 +47,8 @@ def noisy(track, seed):
 def test_friction_by_forecasts_at_30_hz_under_noise_is_the_true_one(simulated_tosses, rigid_box, box_physics):
     tosses = [noisy(t.part(slice(0, None, 5)), 1) for t in simulated_tosses(5, 130)]
     found = found_at(tosses, rigid_box, box_physics)
-    assert found.value == pytest.approx(BOX_FRICTION, rel=0.12)
-    assert abs(found.value - BOX_FRICTION) < found.half_width
+    assert found.friction.value == pytest.approx(BOX_FRICTION, rel=0.12)
+    assert found.friction.low < BOX_FRICTION < found.friction.high
     assert found.law.restitution < 0.15
 
 
@@ -84,32 +91,66 @@ def test_forecasts_and_rollouts_call_the_kernel_with_one_signature(simulated_tos
     assert len(signatures) == 1
 
 
-class Valley(Forecasts):
-    """Scores of a toss that more friction and less restitution explain nearly as well; best at .2, .17 and .06."""
+class Scored(Forecasts):
+    """Scores by a formula of log friction, restitution and the logarithm of what they leave unexplained."""
 
-    def __init__(self, slope):
-        self.slope = slope
+    def __init__(self, formula):
+        self.formula = formula
 
     def scores(self, laws):
-        friction, rebound, rest = np.array(
-            [[np.log(w.friction / 0.2), w.restitution - 0.17, np.log(w.unexplained / 0.06)] for w in laws]
-        ).T
-        return (10 * (friction + self.slope * rebound) ** 2 + 2 * friction**2 + 0.1 * rest**2)[:, None]
+        columns = np.array([[np.log(w.friction), w.restitution, np.log(w.unexplained)] for w in laws]).T
+        return (self.formula(*columns) + np.zeros(len(laws)))[:, None]
 
 
 @pytest.mark.parametrize("slope", [0, 2, 4, 6])
-def test_the_search_follows_a_valley_in_which_friction_trades_for_restitution(slope):
-    assert best_law(Valley(slope)).friction == pytest.approx(0.2, rel=0.15)
+def test_the_posterior_follows_a_valley_in_which_friction_trades_for_restitution(slope):
+    """Best at .2, .32 and .04."""
+
+    def valley(log_friction, rebound, log_rest):
+        off, beside = log_friction - np.log(0.2), rebound - 0.32
+        return 100 * (off + slope * beside) ** 2 + 20 * off**2 + (log_rest - np.log(0.04)) ** 2
+
+    found = posterior(Scored(valley))
+    assert found.unexplained == 0.04
+    assert found.friction.value == pytest.approx(0.2, rel=0.15)
+    assert found.friction.low < 0.2 < found.friction.high
+    assert found.friction.high / found.friction.low < 3
+
+
+def test_tosses_that_tell_nothing_leave_the_prior():
+    found = posterior(Scored(lambda *law: 7.0)).friction
+    assert found.value == pytest.approx(PRIOR_MEDIAN, rel=0.03)
+    assert np.log(found.high / found.low) == pytest.approx(2 * 1.96 * PRIOR_LOG_SIGMA, rel=0.1)
+
+
+def test_two_valleys_are_both_within_the_interval():
+    two = posterior(
+        Scored(lambda log_friction, *_: 30 * np.minimum(*(abs(log_friction - np.log(m)) for m in (0.1, 0.8))))
+    )
+    assert two.friction.low < 0.1
+    assert two.friction.high > 0.8
+
+
+def test_a_marginals_median_and_interval_are_a_gaussians():
+    at = np.linspace(-3.0, 1.0, 16)
+    middle, low, high = marginal(at, -0.5 * ((at + 1.2) / 0.2) ** 2, 0.15)
+    assert middle == pytest.approx(-1.2, abs=0.01)
+    assert high - low == pytest.approx(2 * 1.96 * 0.25, rel=0.03)
+    assert (high - middle, middle - low) == (pytest.approx(0.49, abs=0.04), pytest.approx(0.49, abs=0.04))
+
+
+def test_an_interval_may_hold_the_grids_end():
+    at = np.linspace(0.0, 0.8, 6)
+    middle, low, high = marginal(at, -0.5 * (at / 0.1) ** 2, 0.1)
+    assert low == 0.0
+    assert (middle, high) == (pytest.approx(0.067, abs=0.03), pytest.approx(1.96 * 0.1 * 2**0.5, abs=0.06))
 
 
 @pytest.mark.parametrize("count", [1, 2])
-def test_few_tosses_tell_friction_as_coarsely_as_they_do_on_other_bodies(
-    simulated_tosses, rigid_box, box_physics, count
-):
+def test_few_tosses_hold_the_true_friction_within_their_interval(simulated_tosses, rigid_box, box_physics, count):
     found = found_at([t.part(slice(0, None, 5)) for t in simulated_tosses(count)], rigid_box, box_physics)
-    share, rebound = FEW_TOSSES[count]
-    assert (found.half_width, found.restitution_half_width) == (pytest.approx(share * found.value), rebound)
-    assert abs(found.value - BOX_FRICTION) < 0.5 * BOX_FRICTION
+    assert found.friction.value == pytest.approx(BOX_FRICTION, rel=0.5)
+    assert found.friction.low < BOX_FRICTION < found.friction.high
 
 
 def test_a_toss_that_never_hits_tells_no_friction(simulated_tosses, rigid_box, box_physics):

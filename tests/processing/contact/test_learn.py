@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 import torch
 
+from processing.contact.friction.estimate import Interval
 from processing.contact.learn.dissipation_weight import Candidate, choose
 from processing.contact.learn.fit import FRICTION, Fit, FitConfig, Model, fit
-from processing.contact.learn.intervals import Interval, _sandwich
+from processing.contact.learn.intervals import _sandwich
 from processing.contact.learn.learn import ContactConfig, learn_contact
 from processing.contact.learn.prepared import prepare, transitions
 from processing.contact.learn.prior import prior_from_shape, prior_from_size

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from processing.contact.friction.estimate import Interval
 from processing.live.advice import Throw, options
 from processing.live.friction import LawSoFar, shrink_by
 from processing.live.sides import DIRECTIONS, GUESS, next_starts, sides_of, surface_sigma_m
@@ -59,7 +60,7 @@ def test_a_side_is_touched_where_it_pointed_down_after_the_impact() -> None:
 
 
 def law(information: dict[int, float]) -> LawSoFar:
-    return LawSoFar(0.3, 0.1, 0.1, 0.2, information)
+    return LawSoFar(Interval(0.3, 0.2, 0.4), Interval(0.1, 0.0, 0.3), information)
 
 
 def test_one_more_toss_like_the_only_one_shrinks_its_deviation_by_one_over_root_two() -> None:
@@ -78,14 +79,14 @@ def test_where_every_side_was_seen_the_toss_that_told_most_of_friction_is_advise
     assert [o.shrink for o in found] == sorted((o.shrink for o in found), reverse=True)
 
 
-def test_too_few_impacts_for_friction_are_said() -> None:
+def test_that_no_toss_told_friction_yet_is_said() -> None:
     sides = [sides_of(still(np.eye(3)), CENTER, WORLD_FROM_CAMERA, 2)]
     found = options(sides, None, CENTER, EXTENT_M, WORLD_FROM_CAMERA, None, {0: Throw(2.0, 0.2)})
-    assert [o.text.split(":")[0] for o in found] == ["2 more that fly, hit the table and come to rest"]
+    assert [o.text.split(":")[0] for o in found] == ["a toss that flies, hits the table and comes to rest"]
 
 
 def test_the_law_so_far_says_what_of_restitutions_interval_is_assumed():
-    text = LawSoFar(0.3, 0.1, 0.1, 0.25, {}).text()
+    text = LawSoFar(Interval(0.3, 0.2, 0.4), Interval(0.1, 0.0, 0.35), {}).text()
     assert text == (
         "friction 0.30 (0.20 to 0.40), restitution 0.10 (0.00 to 0.35; +-0.20 of it is assumed, not measured)"
     )
