@@ -41,7 +41,7 @@ from recordings.whole_file import without_nan, write_json
 if TYPE_CHECKING:
     from recordings.session import Session
 
-VERSION = 8
+VERSION = 9
 STEP_S = 1 / 148
 
 

@@ -107,7 +107,8 @@ def follow(
         rough |= expected_pieces(sought.own & ~rough, sought.expected, s.piece_px)
     if rough.sum() < s.least_px:
         return Found(np.zeros_like(rough), 0.0)
-    unknown = ~scene.known if cues is None else cues.unknown
+    # where the table lies is known, depth decides what the colour of an unknown scene cannot
+    unknown = ~scene.known & (scene.depth_m == 0) if cues is None else cues.unknown
     strange = (grown(rough, 5) & unknown).sum() > s.unknown * rough.sum()
     larger = rough.sum() > s.grown * memory.size_px
     if strange or (larger and not _is_all_object(frame, rough, sought.expected, memory, far_px, s)):
@@ -162,8 +163,6 @@ def _sought(
     s: BackgroundSettings,
 ) -> _Sought:
     moved = moved_pixels(frame, scene, s.foreground)
-    if (moved & ~scene.known).any():
-        moved &= scene.known | (memory.likeness.log_odds(frame.color_rgb) > 0)
     if block is not None:
         moved &= ~block
     looked = moved & around(near)

@@ -20,7 +20,7 @@ from processing.store import Done
 from recordings.results.folder import write_hand, write_masks
 from recordings.session import RgbdFrames
 
-VERSION = 15
+VERSION = 16
 
 
 @dataclass(frozen=True)
