@@ -1,7 +1,7 @@
 """Masks without learned weights: what differs from the static scene, followed through the toss by its motion.
 
-Where other things touch the object (a hand, a stick), or of the scene behind it not even the table's place is known, the
-object's own colours, its depth and its last place decide instead.
+Where other things touch the object (a hand, a stick), or not even the table's place is known of the scene behind it,
+the object's own colours, its depth and its last place decide instead.
 """
 
 from __future__ import annotations
