@@ -55,6 +55,18 @@ def test_a_side_never_seen_before_is_the_bodys_own_unless_something_else_was_nea
     assert overlap < 0.75 if other_near else overlap > 0.95
 
 
+def test_a_side_never_seen_before_stays_where_the_body_hid_the_table_from_all_frames() -> None:
+    """Nothing is known of the scene there but where the table lies."""
+    scene, first, body = empty_scene(), np.zeros((H, W), dtype=bool), np.zeros((H, W), dtype=bool)
+    hidden = ~scene.known
+    hidden[35:75, 45:101] = True
+    scene = replace(scene, known=~hidden, color_rgb=np.where(hidden[..., None], np.float32(0), scene.color_rgb))
+    first[BEFORE], body[TURNED] = True, True
+    memory = remember(None, frame((BEFORE, RED, 0.7)), Found(first, 1.0))
+    found = follow(frame((TURNED, BLUE, 0.62), (BEFORE, RED, 0.66)), scene, memory, None, None, BackgroundSettings())
+    assert (found.mask & body).sum() / (found.mask | body).sum() > 0.95
+
+
 def test_late_depth_is_put_where_colour_shows_the_body() -> None:
     color, depth = frame((np.s_[40:70, 50:80], RED, 0.7)), frame((np.s_[44:74, 57:87], RED, 0.7))
     late = replace(color, depth_m=depth.depth_m, depth_time_ns=16_000_000)
