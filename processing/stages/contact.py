@@ -13,7 +13,7 @@ from recordings.results.folder import read_shape, read_track, write_contact, wri
 from recordings.tracks import ObjectShape
 from recordings.whole_file import write_json
 
-VERSION = 8
+VERSION = 9
 NO_PLANE = (
     "the calibration does not say where the table is (no `world`), and contact needs the plane; run `toss-calibrate "
     "table SESSION`, or let it be estimated from depth: --table-from-depth"

@@ -104,14 +104,14 @@ class Scored(Forecasts):
 
 @pytest.mark.parametrize("slope", [0, 2, 4, 6])
 def test_the_posterior_follows_a_valley_in_which_friction_trades_for_restitution(slope):
-    """Best at .2, .32 and .04."""
+    """Best at .2, .32 and .05."""
 
     def valley(log_friction, rebound, log_rest):
         off, beside = log_friction - np.log(0.2), rebound - 0.32
-        return 100 * (off + slope * beside) ** 2 + 20 * off**2 + (log_rest - np.log(0.04)) ** 2
+        return 100 * (off + slope * beside) ** 2 + 20 * off**2 + (log_rest - np.log(0.05)) ** 2
 
     found = posterior(Scored(valley))
-    assert found.unexplained == 0.04
+    assert found.unexplained == 0.05
     assert found.friction.value == pytest.approx(0.2, rel=0.15)
     assert found.friction.low < 0.2 < found.friction.high
     assert found.friction.high / found.friction.low < 3
@@ -131,10 +131,10 @@ def test_two_valleys_are_both_within_the_interval():
     assert two.friction.high > 0.8
 
 
-def test_a_marginals_median_and_interval_are_a_gaussians():
+def test_a_marginals_value_and_interval_are_a_gaussians():
     at = np.linspace(-3.0, 1.0, 16)
     middle, low, high = marginal(at, -0.5 * ((at + 1.2) / 0.2) ** 2, 0.15)
-    assert middle == pytest.approx(-1.2, abs=0.01)
+    assert middle == pytest.approx(-1.2, abs=0.015)
     assert high - low == pytest.approx(2 * 1.96 * 0.25, rel=0.03)
     assert (high - middle, middle - low) == (pytest.approx(0.49, abs=0.04), pytest.approx(0.49, abs=0.04))
 
@@ -142,8 +142,8 @@ def test_a_marginals_median_and_interval_are_a_gaussians():
 def test_an_interval_may_hold_the_grids_end():
     at = np.linspace(0.0, 0.8, 6)
     middle, low, high = marginal(at, -0.5 * (at / 0.1) ** 2, 0.1)
-    assert low == 0.0
-    assert (middle, high) == (pytest.approx(0.067, abs=0.03), pytest.approx(1.96 * 0.1 * 2**0.5, abs=0.06))
+    assert low == 0.0 <= middle < 0.07
+    assert high == pytest.approx(1.96 * 0.1 * 2**0.5, abs=0.06)
 
 
 @pytest.mark.parametrize("count", [1, 2])
