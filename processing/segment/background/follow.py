@@ -107,8 +107,7 @@ def follow(
         rough |= expected_pieces(sought.own & ~rough, sought.expected, s.piece_px)
     if rough.sum() < s.least_px:
         return Found(np.zeros_like(rough), 0.0)
-    # where the table lies is known, depth decides what the colour of an unknown scene cannot
-    unknown = ~scene.known & (scene.depth_m == 0) if cues is None else cues.unknown
+    unknown = scene.unknown if cues is None else cues.unknown
     strange = (grown(rough, 5) & unknown).sum() > s.unknown * rough.sum()
     larger = rough.sum() > s.grown * memory.size_px
     if strange or (larger and not _is_all_object(frame, rough, sought.expected, memory, far_px, s)):

@@ -217,8 +217,7 @@ class BackgroundSegmenter:
     def _scene_without(self, frame: RgbdFrame, mask: Bool[Array, "h w"]) -> StaticScene:
         moved = moved_pixels(frame, self._scene, self._settings.foreground) | bare_table(self._scene)
         stands_out = (moved & mask).sum() >= self._settings.part_of_scene * mask.sum()
-        # before the table, depth decides what the scene's unknown colour cannot
-        unknown = (~self._scene.known & (self._scene.depth_m == 0) & surroundings(mask)).sum()
+        unknown = (self._scene.unknown & surroundings(mask)).sum()
         # with a robot the scene is learned behind what it holds: what is unknown there lies behind the robot itself
         if stands_out and (self._drawn is not None or unknown <= self._settings.unknown * mask.sum()):
             return self._scene

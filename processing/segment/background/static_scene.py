@@ -78,10 +78,14 @@ class StaticScene:
     known: Bool[Array, "h w"]
     table_depth_m: Float32[Array, "h w"]
 
+    @property
+    def unknown(self) -> Bool[Array, "h w"]:
+        """Where neither its colour is known nor where it lies: before a table that is, depth decides."""
+        return ~self.known & (self.depth_m == 0)
+
     def write(self, folder: Path) -> None:
         """Into a stage's folder, as scene.npz."""
-        with open(folder / "scene.npz", "wb") as out:
-            np.savez(out, **vars(self))
+        np.savez(folder / "scene.npz", **vars(self))
 
     @staticmethod
     def read(folder: Path) -> StaticScene:
