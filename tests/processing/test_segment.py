@@ -199,6 +199,20 @@ def test_corners_that_slide_along_stripes_tell_of_no_moving_camera() -> None:
     assert np.isnan(picture_shifts(pictures, None)).tolist() == [True, False, True]
 
 
+def test_a_table_with_holes_stands_still_whatever_the_cameras_gain() -> None:
+    """Brightness that drifts made its corners leap from hole to hole, and the session was refused."""
+    rng = np.random.default_rng(8)
+
+    def seen(gain: float) -> Any:
+        table = np.full((240, 424), 150, dtype=np.float64)
+        for row, column in np.ndindex(12, 22):
+            table[row * 20 + 8 : row * 20 + 12, column * 19 + 6 : column * 19 + 10] = 40
+        noisy = gain * table + rng.normal(0, 2, table.shape)
+        return np.repeat(np.clip(noisy, 0, 255).astype(np.uint8)[..., None], 3, axis=2)
+
+    assert max(picture_shifts([seen(0.9), seen(1.0), seen(0.6)], None)) < 0.1
+
+
 def test_images_that_change_their_size_are_refused(tiny_world: Any) -> None:
     frame, _ = tiny_world.see(None)
     smaller = replace(frame, color_rgb=frame.color_rgb[::2, ::2], depth_m=frame.depth_m[::2, ::2])

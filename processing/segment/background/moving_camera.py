@@ -45,6 +45,9 @@ object before a plain room are many, but lie together. Where fewer cells are fol
 ALIKE = 0.5
 """More than half of the cells shift alike, but for this share of the shift, or nothing can be told: what lies near a
 camera shifts more than what lies far, but corners on stripes slide along them, each by another length."""
+AROUND_PX, NOISE_LEVELS = 8.0, 4.0
+"""Corners are followed by what differs from its neighbourhood (as wide as the window below), in units of its contrast,
+which is noise below so many grey levels."""
 FOLLOW: Mapping[str, Any] = {"winSize": (21, 21), "maxLevel": 3}
 
 
@@ -59,7 +62,7 @@ def picture_shifts(colors: Sequence[UInt8[Array, "h w 3"]], hidden: Sequence[Boo
     reference, corners = _corners(colors[middle], None if hidden is None else hidden[middle])
     if corners is None:
         return [float("nan")] * len(others)
-    return [_shift(reference, _grey(other), corners) for other in others]
+    return [_shift(reference, _even(_grey(other)), corners) for other in others]
 
 
 def why_other_scene(
@@ -71,14 +74,15 @@ def why_other_scene(
     """
     if any(f.color_rgb.shape != reference.color_rgb.shape for f in others):
         return "its images have another size"
-    grey, corners = _corners(reference.color_rgb, None if hidden is None else hidden[0])
-    shifts = [] if corners is None else [_shift(grey, _grey(f.color_rgb), corners) for f in others]
+    even, corners = _corners(reference.color_rgb, None if hidden is None else hidden[0])
+    shifts = [] if corners is None else [_shift(even, _even(_grey(f.color_rgb)), corners) for f in others]
     if shifts and np.isnan(shifts).all():
+        grey = _grey(reference.color_rgb)
         if max(_correlation(grey, _grey(f.color_rgb)) for f in others) < SAME_PICTURE:
             return "its picture has nothing in common with theirs"
     elif shifts and np.nanmax(shifts) >= MOVED_PX / 2:
         return f"the camera was moved (its picture is shifted by {np.nanmax(shifts):.1f} px)"
-    covered = [np.zeros(grey.shape, dtype=bool)] * (len(others) + 1) if hidden is None else hidden
+    covered = [np.zeros(even.shape, dtype=bool)] * (len(others) + 1) if hidden is None else hidden
     alike = [_share_alike(reference, f, covered[0] | h) for f, h in zip(others, covered[1:], strict=True)]
     if np.median(alike) < SAME_SCENE:
         return f"its depth shows another scene ({100 * np.median(alike):.0f} % of it agree)"
@@ -112,18 +116,29 @@ def _grey(color_rgb: UInt8[Array, "h w 3"]) -> UInt8[Array, "h w"]:
 def _corners(
     color_rgb: UInt8[Array, "h w 3"], hidden: Bool[Array, "h w"] | None
 ) -> tuple[UInt8[Array, "h w"], Float32[Array, "n 1 2"] | None]:
-    """The picture in grey, and its corners; None where there are too few."""
+    """The picture, even, and its corners; None where there are too few."""
     import cv2
 
     grey = _grey(color_rgb)
     free = None if hidden is None else np.where(hidden, 0, 255).astype(np.uint8)
     corners = cv2.goodFeaturesToTrack(grey, CORNERS, 0.01, 6, mask=free)
-    return grey, None if corners is None or len(corners) < LEAST_CORNERS else np.asarray(corners)
+    return _even(grey), None if corners is None or len(corners) < LEAST_CORNERS else np.asarray(corners)
 
 
-def _cells(grey: UInt8[Array, "h w"], corners: Float32[Array, "n 1 2"]) -> Int[Array, " n"]:
+def _even(grey: UInt8[Array, "h w"]) -> UInt8[Array, "h w"]:
+    """The picture without its brightness and contrast in the neighbourhood: a camera's gain changes from frame to
+    frame, and brightness that differs makes corners leap by a period of a pattern that repeats (a table's holes)."""
+    import cv2
+
+    picture = grey.astype(np.float32)
+    detail = picture - cv2.GaussianBlur(picture, (0, 0), AROUND_PX)
+    contrast = np.sqrt(cv2.GaussianBlur(detail * detail, (0, 0), AROUND_PX))
+    return np.asarray(np.clip(128 + 48 * detail / (contrast + NOISE_LEVELS), 0, 255).astype(np.uint8))
+
+
+def _cells(picture: UInt8[Array, "h w"], corners: Float32[Array, "n 1 2"]) -> Int[Array, " n"]:
     """The number of each corner's cell of the picture."""
-    row, column = (corners[:, 0, ::-1] * CELLS / grey.shape).astype(np.int64).T
+    row, column = (corners[:, 0, ::-1] * CELLS / picture.shape).astype(np.int64).T
     return np.asarray(row * CELLS[1] + column)
 
 

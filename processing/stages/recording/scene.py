@@ -19,7 +19,7 @@ from processing.segment.background.static_scene import (
 from processing.store import Done
 from recordings.records import RgbdFrame
 
-VERSION = 10
+VERSION = 11
 
 
 @dataclass(frozen=True)
