@@ -13,7 +13,7 @@ from recordings.results.folder import read_shape, read_track, write_contact, wri
 from recordings.tracks import ObjectShape
 from recordings.whole_file import write_json
 
-VERSION = 9
+VERSION = 10
 NO_PLANE = (
     "the calibration does not say where the table is (no `world`), and contact needs the plane; run `toss-calibrate "
     "table SESSION`, or let it be estimated from depth: --table-from-depth"
@@ -62,12 +62,11 @@ def _learn(run: Run, name: str, tracks: Mapping[int, Done], folder: Path, prior:
 
     if run.world_from_camera is None:
         raise BadInput(NO_PLANE)
-    plane = calibrated_plane(run.session.calibration)
     learned = learn_from_tracks(
         {t: read_track(d.folder, t) for t, d in tracks.items()},
         prior,
         run.world_from_camera,
-        plane,
+        calibrated_plane(run.session.calibration),
         physics_of_session(run.session.start),
         run.config.contact,
         run.progress(f"{name}: contact"),
@@ -75,7 +74,7 @@ def _learn(run: Run, name: str, tracks: Mapping[int, Done], folder: Path, prior:
     write_shape(folder, learned.shape)
     write_contact(folder, learned.model)
     write_assets(folder, learned.model, learned.shape)
-    write_rollouts(folder, learned.fused, learned.rollouts, plane)
+    write_rollouts(folder, learned.fused, learned.rollouts, learned.plane)
     write_json(folder / "result.json", learned.document)
     return ContactResult(
         friction=learned.model.friction,

@@ -41,7 +41,7 @@ from recordings.whole_file import without_nan, write_json
 if TYPE_CHECKING:
     from recordings.session import Session
 
-VERSION = 9
+VERSION = 10
 STEP_S = 1 / 148
 
 
@@ -78,7 +78,7 @@ def learn_contact_only(
         raise BadInput(f"no poses of the tosses {missing} in {source.name}")
     marked = tuple(t for t in tested if t not in learned)
     refuse_leaks(learned, marked, duplicate_groups([tracks[t] for t in sorted({*learned, *tested})]))
-    plane = calibrated_plane(session.calibration)
+    calibrated = calibrated_plane(session.calibration)
     given = physics_of_session(session.start)
     train = [tracks[t] for t in learned]
     wanted, steps = steps, min(steps, max(DEFAULT_STEPS, _longest(tracks[t] for t in tested)))
@@ -86,9 +86,11 @@ def learn_contact_only(
 
     def compute(folder: Path) -> ContactOnlyResult:
         with of_own_tracks() if source.of_vision else nullcontext():
-            learning, shape, extra = _learn(train, geometry, init_m, source, given, plane, config, progress)
+            found = _learn(train, geometry, init_m, source, given, calibrated, config, progress)
+        learning, plane = found.learning, found.plane
         evaluation = evaluate(learning, [tracks[t] for t in tested], plane, steps, STEP_S, "thrown")
-        document, more = result_document(learning, evaluation), _warnings(geometry, source, wanted, steps)
+        document = result_document(learning, evaluation)
+        more = [*found.warnings, *_warnings(geometry, source, wanted, steps)]
         document |= {
             "session": session.name,
             "poses": source.name,
@@ -100,14 +102,14 @@ def learn_contact_only(
             "warnings": [*(n.text for n in warnings_of(learning)), *more],
             "seconds": time.perf_counter() - began,
             "cpu_seconds_total": time.process_time(),
-            **extra,
+            **found.extra,
         }
-        _write(folder, session, learning, shape, evaluation, marked, document, plane)
+        _write(folder, session, learning, found.shape, evaluation, marked, document, plane)
         return ContactOnlyResult(result_text(learning, evaluation, more))
 
     settings: dict[str, Any] = {"train": list(learned), "test": list(tested), "geometry": geometry or "from the data"}
     settings |= {"init_m": init_m, "steps": steps, "steps_wanted": wanted, "device": device}
-    inputs = {"poses": _digest(tracks, learned, tested), "about": _about(source, given, plane)}
+    inputs = {"poses": _digest(tracks, learned, tested), "about": _about(source, given, calibrated)}
     done = Store(out_dir).run("contact-only", VERSION, settings, inputs, ContactOnlyResult, compute)
     document = stage_document(done.folder / "result.json")
     assets = {f: str(done.folder / "assets" / f / f"object{s}") for f, s in ASSET_FILES.items()}
@@ -181,16 +183,26 @@ def _about(source: PoseSource, given: Physics | None, plane: Plane) -> str:
     return content.hexdigest()
 
 
+@dataclass(frozen=True, eq=False)
+class _Learned:
+    """What was learned, the shape, the plane that it was learned on, and what else the document says."""
+
+    learning: ContactLearning
+    shape: ObjectShape
+    plane: Plane
+    warnings: Sequence[str]
+    extra: Mapping[str, Any]
+
+
 def _learn(
     train: Sequence[PoseSeries], geometry: str | None, init_m: float | None, source: PoseSource, given: Physics | None,
     plane: Plane, config: ContactConfig, progress: Progress,
-) -> tuple[ContactLearning, ObjectShape, Mapping[str, Any]]:  # fmt: skip
-    """From vision's shape (corrected where contact knows better) or from a size alone; the shape, and what else the
-    document says."""
+) -> _Learned:  # fmt: skip
+    """From vision's shape (corrected where contact knows better) or from a size alone."""
     if source.shape is None or init_m is not None or geometry == "box":
         prior, physics = make_prior(geometry, init_m, source, given, train, plane)
         learning = learn_contact(train, prior, physics, plane, config, progress)
-        return learning, learning.shape, {}
+        return _Learned(learning, learning.shape, plane, (), {})
     base = TracksConfig()
     wanted: ClassName | None = geometry if geometry in CLASSES else None
     contact = replace(config, penetration=base.contact.penetration, bootstrap_repeats=base.contact.bootstrap_repeats)
@@ -199,7 +211,8 @@ def _learn(
         train, source.shape, plane, physics, replace(base, contact=contact, geometry=wanted), progress
     )
     extra = {k: found.document[k] for k in ("geometry_choice", "contact_alone", "fusion", "contact_loss_j")}
-    return found.fused, found.shape, extra
+    warnings = [found.plane_off.text] if found.plane_off else []
+    return _Learned(found.fused, found.shape, found.plane, warnings, extra)
 
 
 def shape_physics(shape: ObjectShape, given: Physics | None) -> Physics:

@@ -12,7 +12,7 @@ from recordings.errors import BadInput
 from recordings.results.folder import read_shape, read_track, write_contact
 from recordings.whole_file import write_json
 
-VERSION = 6
+VERSION = 7
 
 
 @dataclass(frozen=True)

@@ -302,15 +302,20 @@ def check_plane(heights_m: Mapping[int, float], what: str) -> float | None:
     return height
 
 
+def say_alike(heights_m: Mapping[int, float]) -> bool:
+    """Whether two tosses or more rest as far off the plane, within half of it."""
+    off = np.array(list(heights_m.values()))
+    return len(off) > 1 and bool(np.abs(off - np.median(off)).max() <= 0.5 * abs(float(np.median(off))))
+
+
 def _causes(heights_m: Mapping[int, float]) -> str:
     """Why a resting object is not on the plane, the likeliest first: a wrong plane or size is off by as much in every
     toss, wrong poses are not."""
     poses = "the poses at rest (look at them with `toss-view`) or parts of the shape that were not seen"
     plane = "the plane (`toss-calibrate table SESSION`, or by `--table-from-depth`) or the size of the shape"
-    off = np.array(list(heights_m.values()))
-    if len(off) < 2:
+    if len(heights_m) < 2:
         return f"One toss cannot tell which is wrong: {poses}, or {plane}"
-    if np.abs(off - np.median(off)).max() > 0.5 * abs(float(np.median(off))):
+    if not say_alike(heights_m):
         return f"Tosses differ, so most likely wrong are {poses}; less likely {plane}"
     return f"Every toss says the same, so most likely wrong is {plane}; less likely {poses}"
 

@@ -13,7 +13,7 @@ from numpy import ndarray as Array
 
 from processing.contact.fuse import Field, FusionConfig, Readings, Sizes, Surface, likely_sizes, thinned
 from processing.contact.learn.convexity import ClassName, GeometryChoice, choose_geometry, measured_prior, start_points
-from processing.contact.learn.data_checks import check_plane, lowest_point_m, of_own_tracks
+from processing.contact.learn.data_checks import of_own_tracks
 from processing.contact.learn.fit import FRICTION, Model, fit_lbfgs
 from processing.contact.learn.learn import (
     ContactConfig,
@@ -24,18 +24,19 @@ from processing.contact.learn.learn import (
     with_friction,
 )
 from processing.contact.learn.prior import Prior
+from processing.contact.learn.resting_plane import plane_of_rests
 from processing.contact.learn.shape_comparison import losses_of, mean_loss_j, series_of, usable
 from processing.contact.physics.geometry import SCALE_M, FreePoints, pieces_mesh
 from processing.contact.physics.inertia import Physics, uniform_physics
 from processing.contact.physics.loss import REFERENCE_MASS_KG, contact_loss, find_contacts, point_velocity
 from processing.contact.physics.plane import Plane
-from processing.contact.physics.support import surface_samples
 from processing.contact.report.result import left_out_notice, result_document, warnings_of
 from processing.contact.report.rollout_errors import FIGURE_4_STEPS, Evaluation, evaluate
 from processing.motion.trajectory import PoseSeries
 from recordings.constants import GRAVITY_M_S2
 from recordings.errors import BadInput
 from recordings.geometry import Transform
+from recordings.notices import Notice
 from recordings.progress import Progress, Silent
 from recordings.tracks import ContactModel, ObjectShape, ObjectTrack
 
@@ -43,9 +44,6 @@ REACH = 0.15
 """Neighbourhood of a touched point in which the prior is compared with it, as a share of the mean extent."""
 BLUR = 0.1
 """What a touch reads is blurred by this share of the point's way between two frames: the impact was somewhere on it."""
-SUNK_SHARE = 0.01
-"""So much of the surface must lie below the plane before the shape counts as sunk into it; less is spikes."""
-SURFACE_POINTS = 4000
 NEAR_M = 0.005
 """A point this near to the plane may read the surface."""
 
@@ -84,6 +82,10 @@ class TrackLearning:
     fused: ContactLearning
     choice: GeometryChoice
     left_out: Mapping[int, str]
+    plane: Plane
+    """The one that contact was learned on."""
+    plane_off: Notice | None
+    """What to say where it is not the one that was given."""
 
 
 def learn_from_tracks(
@@ -125,11 +127,12 @@ def learn_from_series(
     plane, config, progress = plane or Plane(), config or TracksConfig(), progress or Silent()
     physics = physics or uniform_physics(shape)
     sigmas = (config.held_seen_m, config.held_unseen_m)
+    hull = measured_prior("hull", shape, physics, *sigmas)
+    plane, off = plane_of_rests(series, shape, hull, physics, plane)
     choice = choose_geometry(series, shape, physics, plane, config.contact, sigmas, config.geometry)
-    prior = measured_prior(choice.name, shape, physics, *sigmas)
+    prior = hull if choice.name == "hull" else measured_prior(choice.name, shape, physics, *sigmas)
     alone = replace(config.contact, friction_by_forecasts=False)  # they are made once the geometry is fused
     learning = learn_contact(series, prior, physics, plane, alone, progress)
-    _check_seen_rests(learning, shape, prior)
     surface = Surface(shape.vertices_m, shape.observed)
     readings, plane_m = readings_of(learning, prior), config.fusion.plane_m if plane.std_m is None else plane.std_m
     sizes = likely_sizes(readings, surface, config.fusion, plane_m)
@@ -144,8 +147,10 @@ def learn_from_series(
     )
     left_out = {**(left_out or {}), **learning.left_out}
     length = np.linalg.norm(moved, axis=1)
-    document = _document(learning, fused, rollouts, prior, choice, readings, sizes, length, shape, left_out, plane)
-    return TrackLearning(refined, fused.model, length, rollouts, document, learning, fused, choice, left_out)
+    document = _document(learning, fused, rollouts, prior, choice, readings, sizes, length, shape, left_out, plane, off)
+    return TrackLearning(
+        refined, fused.model, length, rollouts, document, learning, fused, choice, left_out, plane, off
+    )
 
 
 def _check_frames(tracks: Mapping[int, ObjectTrack], shape: ObjectShape, world_from_camera: Transform) -> None:
@@ -157,28 +162,6 @@ def _check_frames(tracks: Mapping[int, ObjectTrack], shape: ObjectShape, world_f
     cameras = {t.camera for t in tracks.values()}
     if cameras - {world_from_camera.source} or world_from_camera.target != "world":
         raise BadInput(f"tracks in {sorted(cameras)} cannot be moved by {world_from_camera}; wanted world_from_camera")
-
-
-def _check_seen_rests(learning: ContactLearning, shape: ObjectShape, prior: Prior) -> None:
-    """Raises BadInput where what a camera saw rests more than 5 mm off the plane: the plane or the scale is wrong.
-    What no camera saw proves nothing, and neither does a spike that reaches below the plane."""
-    local = prior.frame.inside(shape.vertices_m)
-    points, surface = start_points(prior), surface_samples(local, shape.faces, SURFACE_POINTS)
-    seen = np.ones(len(points), dtype=bool)
-    if shape.observed is not None:
-        from scipy.spatial import cKDTree
-
-        seen = shape.observed[cKDTree(local).query(points)[1]]
-    heights = {}
-    for track, smoothed in zip(learning.prepared.tracks, learning.prepared.smoothed):
-        if smoothed.phases.rest is None:
-            continue
-        reach = track.rotation[smoothed.phases.rest :, 2].mean(0) @ points.T
-        if seen[reach.argmin()]:
-            lowest = lowest_point_m(track, points, smoothed.phases) or 0.0
-            sunk = lowest_point_m(track, surface, smoothed.phases, SUNK_SHARE) or 0.0
-            heights[track.toss] = lowest if lowest > 0 else max(lowest, min(sunk, 0.0))
-    check_plane(heights, "vision's shape (a part that a camera saw)")
 
 
 def readings_of(learning: ContactLearning, prior: Prior) -> Readings:
@@ -276,6 +259,7 @@ def _document(
     shape: ObjectShape,
     left_out: Mapping[int, str],
     plane: Plane,
+    plane_off: Notice | None,
 ) -> dict[str, Any]:
     """Everything a reader needs to judge it, as JSON values."""
     seen = np.ones(len(moved_m), dtype=bool) if shape.observed is None else shape.observed
@@ -315,6 +299,7 @@ def _document(
         "warnings": [
             n.to_json()
             for n in (
+                *([plane_off] if plane_off else ()),
                 *(left_out_notice(t, why) for t, why in left_out.items() if t not in learning.left_out),
                 *warnings_of(learning),
             )

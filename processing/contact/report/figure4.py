@@ -68,7 +68,7 @@ def learn_figure_4(
         raise BadInput(f"Figure 4 learns on all tosses but the last; {len(there)} can be used, wanted at least 2")
     learned = {t: tracks[t] for t in there[:-1]}
     found = learn_from_tracks(learned, shape, world_from_camera, plane, physics, config, progress)
-    return figure_4(found.fused, {t: tracks[t] for t in there}, world_from_camera, plane), found
+    return figure_4(found.fused, {t: tracks[t] for t in there}, world_from_camera, found.plane), found
 
 
 def figure_4(
