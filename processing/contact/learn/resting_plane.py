@@ -28,7 +28,10 @@ SUNK_SHARE = 0.01
 """So much of the surface must lie below the plane before the shape counts as sunk into it; less is spikes."""
 SURFACE_POINTS = 4000
 MOST_OFF_M = 0.03
-"""A calibration is off by millimetres; by more than this, another table was meant."""
+"""By more than this no calibration is off: another table was meant ..."""
+MOST_OFF_BY_ONE_M = 0.01
+"""... and where one toss alone says so, by more than this its pose at rest is more likely wrong: cameras are placed to
+0 to 8 mm in labs."""
 
 
 def plane_of_rests(
@@ -45,26 +48,29 @@ def moved_to(heights_m: Mapping[int, float], plane: Plane) -> tuple[Plane, Notic
     rests), and what to say of that.
 
     Its standard deviation is then what it was off by: the shape lies on it by construction, so that touches say nothing
-    of the shape's size. Raises BadInput where objects rest more than 5 mm off it, and one toss alone says so, tosses
-    differ, or it is more than 3 cm."""
+    of the shape's size. Raises BadInput where objects rest more than 5 mm off it and tosses differ, or it is more than
+    3 cm (1 cm where there is one toss)."""
     height_m = float(np.median(list(heights_m.values()))) if heights_m else 0.0
-    if abs(height_m) <= PLANE_TOLERANCE_M or not say_alike(heights_m) or abs(height_m) > MOST_OFF_M:
+    alone = len(heights_m) == 1
+    most_m = MOST_OFF_BY_ONE_M if alone else MOST_OFF_M if say_alike(heights_m) else PLANE_TOLERANCE_M
+    if not PLANE_TOLERANCE_M < abs(height_m) <= most_m:
         check_plane(heights_m, "vision's shape (a part that a camera saw)")
         return plane, None
-    side = "above" if height_m > 0 else "below"
+    who, side = "one toss rests" if alone else "all tosses rest", "above" if height_m > 0 else "below"
     each = ", ".join(f"toss {t}: {1e3 * h:.1f} mm" for t, h in heights_m.items())
     seen = (
-        f"all tosses rest {1e3 * abs(height_m):.1f} mm {side} the table as it was calibrated ({each}): contact was "
-        "learned on a plane there"
+        f"{who} {1e3 * abs(height_m):.1f} mm {side} the table as it was calibrated ({each}): contact was learned on a "
+        "plane there"
     )
     do = "`toss-calibrate table SESSION`, or `--table-from-depth`; less likely the shape is too large or too small"
+    do += ", or the pose at rest is off" if alone else ""
     moved = replace(
         plane,
         offset_m=plane.offset_m + height_m,
         std_m=abs(height_m),
         source=f"where tosses rest, {1e3 * abs(height_m):.1f} mm {side} {plane.source}",
     )
-    return moved, Notice("contact", "high", seen, do, "likely")
+    return moved, Notice("contact", "high", seen, do, "possible" if alone else "likely")
 
 
 def _rest_heights_m(
