@@ -17,6 +17,7 @@ docs/decisions/friction.md has the figures, and what was tried instead.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -63,6 +64,12 @@ class Interval:
 
     def to_json(self) -> dict[str, float]:
         return {"value": self.value, "low": self.low, "high": self.high}
+
+
+FRICTION_UNSEEN = Interval(
+    PRIOR_MEDIAN, PRIOR_MEDIAN * math.exp(-1.96 * PRIOR_LOG_SIGMA), PRIOR_MEDIAN * math.exp(1.96 * PRIOR_LOG_SIGMA)
+)
+"""Friction where nothing tells it."""
 
 
 @dataclass(frozen=True, eq=False)

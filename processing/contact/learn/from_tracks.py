@@ -301,7 +301,7 @@ def _document(
             for n in (
                 *([plane_off] if plane_off else ()),
                 *(left_out_notice(t, why) for t, why in left_out.items() if t not in learning.left_out),
-                *warnings_of(learning),
+                *warnings_of(fused),
             )
         ],
     }

@@ -50,6 +50,8 @@ class Spread:
     friction: float
     extents_m: Float[Array, "3"]
     points_m: Float[Array, "v 3"] | None
+    friction_seen: bool = True
+    """Whether the tosses told friction."""
 
 
 def extents(points_m: Float[Array, "v 3"]) -> Float[Array, "3"]:

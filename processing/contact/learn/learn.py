@@ -11,7 +11,13 @@ import torch
 from jaxtyping import Bool, Float
 from numpy import ndarray as Array
 
-from processing.contact.friction.estimate import ForecastFriction, Interval, frames_are_slow, friction_by_forecasts
+from processing.contact.friction.estimate import (
+    FRICTION_UNSEEN,
+    ForecastFriction,
+    Interval,
+    frames_are_slow,
+    friction_by_forecasts,
+)
 from processing.contact.friction.forecast import Law, RigidBody
 from processing.contact.friction.plane_forecast import plane_by_forecasts
 from processing.contact.learn import data_checks as checks
@@ -29,10 +35,6 @@ from processing.contact.physics.plane import Plane
 from processing.motion.trajectory import PoseSeries, Steps
 from recordings.progress import Progress, Silent
 from recordings.tracks import ContactModel, ObjectShape
-
-LOSS_WHEN_SLOW = 0.35
-"""Half the 95 % interval of the loss's friction where frames are too far apart for it: the 95 % quantile of its error
-in 85 single tosses of simulated bodies (tools/bench_intervals.py slow)."""
 
 
 @dataclass(frozen=True)
@@ -288,13 +290,18 @@ def with_friction(
     done: Fit, spread: Spread, slow: ForecastFriction | None, prepared: Prepared, config: ContactConfig
 ) -> tuple[Fit, Spread]:
     """A fit with the friction by forecasts, where there is one, and the intervals' method. Where it was wanted and no
-    toss flies and hits the plane, the loss's friction stays, and may be far off."""
-    if slow is None:
-        wanted = forecasts_are_wanted(prepared, config)
-        return done, replace(spread, friction=max(spread.friction, LOSS_WHEN_SLOW)) if wanted else spread
+    toss flies and hits the plane, nothing is known of it: what any friction may be stands there, for the loss's is far
+    off (0 +- .35 for .69)."""
+    if slow is None and not forecasts_are_wanted(prepared, config):
+        return done, spread
+    unseen = FRICTION_UNSEEN
+    friction = unseen.value if slow is None else slow.friction.value
     parameters = done.parameters.copy()
-    parameters[FRICTION] = slow.friction.value**0.5
-    return replace(done, parameters=parameters), replace(spread, method=f"{spread.method}; friction by forecasts")
+    parameters[FRICTION] = friction**0.5
+    found = replace(done, parameters=parameters)
+    if slow is None:
+        return found, replace(spread, friction=unseen.high - unseen.value, friction_seen=False)
+    return found, replace(spread, method=f"{spread.method}; friction by forecasts")
 
 
 def touched_points(fitted: Model, body: Body, data: StepData, weights: Weights) -> Bool[Array, " v"]:

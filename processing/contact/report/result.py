@@ -79,6 +79,10 @@ def warnings_of(learning: ContactLearning) -> list[Notice]:
         seen = f"{count} moments of contact were not learned from: the plane cannot explain their impacts"
         do = "most often the track is off there, else something other than the table was hit"
         found.append(Notice("contact", "medium", seen, do))
+    if not learning.spread.friction_seen:
+        seen = "no toss is seen to fly and to hit the plane: nothing is known of friction, a usual one stands there"
+        do = "look at the frames after the release with `toss-view RESULTS`; most often they are unsure, or too few"
+        found.append(Notice("contact", "high", seen, do))
     if learning.solver_failures:
         seen = f"{learning.solver_failures} moments of contact could not be solved for their forces at the end"
         found.append(Notice("contact", "medium", seen, "friction and shape are less sure than their intervals"))

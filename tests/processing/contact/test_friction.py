@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from processing.contact.friction.estimate import (
+    FRICTION_UNSEEN,
     PRIOR_LOG_SIGMA,
     PRIOR_MEDIAN,
     frames_are_slow,
@@ -13,9 +14,9 @@ from processing.contact.friction.estimate import (
     posterior,
 )
 from processing.contact.friction.forecast import MEMBERS, Forecasts, Law, ObservedTrajectory, RigidBody
-from processing.contact.learn.fit import Fit
+from processing.contact.learn.fit import FRICTION, Fit
 from processing.contact.learn.intervals import Spread
-from processing.contact.learn.learn import LOSS_WHEN_SLOW, ContactConfig, with_friction
+from processing.contact.learn.learn import ContactConfig, with_friction
 from processing.contact.learn.prepared import prepare
 from processing.contact.learn.prior import prior_from_size
 from processing.contact.physics.plane import Plane
@@ -158,15 +159,19 @@ def test_a_toss_that_never_hits_tells_no_friction(simulated_tosses, rigid_box, b
     assert found_at(flight, rigid_box, box_physics) is None
 
 
-def test_where_forecasts_were_wanted_and_none_could_be_made_the_losss_interval_is_as_wide_as_its_error(
-    simulated_tosses, box_physics
-):
+def test_where_forecasts_were_wanted_and_none_could_be_made_friction_is_what_any_may_be(simulated_tosses, box_physics):
     frame, fit = prior_from_size("box", 0.08).frame, Fit(np.array([0.3]), 0.0, 1, 0, 0)
-    for every, width in ((1, 0.02), (5, LOSS_WHEN_SLOW)):
+    spread = Spread("bootstrap", 0.02, np.zeros(3), None)
+    for every, seen in ((1, True), (5, False)):
         tosses = [t.part(slice(0, None, every)) for t in simulated_tosses(1)]
         prepared = prepare(tosses, frame, Plane(), box_physics.inertia_kgm2)
-        told, spread = with_friction(fit, Spread("bootstrap", 0.02, np.zeros(3), None), None, prepared, ContactConfig())
-        assert (told, spread.friction) == (fit, width)
+        told, wide = with_friction(fit, spread, None, prepared, ContactConfig())
+        assert wide.friction_seen == seen
+        if seen:
+            assert (told, wide) == (fit, spread)
+        else:
+            assert told.parameters[FRICTION] ** 2 == pytest.approx(FRICTION_UNSEEN.value)
+            assert wide.friction > 1.0
 
 
 def test_a_cameras_frames_are_slow_and_a_motion_capture_systems_are_not(simulated_tosses):
