@@ -62,7 +62,8 @@ def moved_to(heights_m: Mapping[int, float], plane: Plane) -> tuple[Plane, Notic
         f"{who} {1e3 * abs(height_m):.1f} mm {side} the table as it was calibrated ({each}): contact was learned on a "
         "plane there"
     )
-    do = "`toss-calibrate table SESSION`, or `--table-from-depth`; less likely the shape is too large or too small"
+    do = "most likely something lies on the table (a mat), or it is calibrated too low: " if height_m > 0 else ""
+    do += "`toss-calibrate table SESSION`, or `--table-from-depth`; less likely the shape is too large or too small"
     do += ", or the pose at rest is off" if alone else ""
     moved = replace(
         plane,
