@@ -294,14 +294,14 @@ def with_friction(
     off (0 +- .35 for .69)."""
     if slow is None and not forecasts_are_wanted(prepared, config):
         return done, spread
-    unseen = FRICTION_UNSEEN
-    friction = unseen.value if slow is None else slow.friction.value
+    friction = FRICTION_UNSEEN if slow is None else slow.friction
     parameters = done.parameters.copy()
-    parameters[FRICTION] = friction**0.5
-    found = replace(done, parameters=parameters)
+    parameters[FRICTION] = friction.value**0.5
     if slow is None:
-        return found, replace(spread, friction=unseen.high - unseen.value, friction_seen=False)
-    return found, replace(spread, method=f"{spread.method}; friction by forecasts")
+        spread = replace(spread, friction=friction.high - friction.value, friction_seen=False)
+    else:
+        spread = replace(spread, method=f"{spread.method}; friction by forecasts")
+    return replace(done, parameters=parameters), spread
 
 
 def touched_points(fitted: Model, body: Body, data: StepData, weights: Weights) -> Bool[Array, " v"]:
