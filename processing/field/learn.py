@@ -14,17 +14,17 @@ from processing.engine.parts import side_by_side
 from processing.field.fuse import LEAST_SEEN
 from processing.field.mesh import extract_mesh
 from processing.field.train import FieldConfig, train_field
-from processing.field.views import FieldView, make_view, object_points, without_strays
+from processing.field.views import FieldView, make_view, object_surface, without_strays
 from processing.motion.interpolate import pose_at
 from recordings.errors import BadInput
-from recordings.geometry import CameraModel, skew
+from recordings.geometry import CameraModel
 from recordings.progress import Progress
 from recordings.records import RgbdFrame
 from recordings.results.folder import RobotMasks
 from recordings.tracks import ObjectShape, ObjectTrack
 
 SURE_M = 0.004
-"""A view whose pose may be off by so much on the body (root mean square) counts half, one that is surer more
+"""A view whose pose may put the surface off by so much (root mean square) counts half, one that is surer more
 (docs/decisions/fusion-weights.md)."""
 
 
@@ -89,8 +89,8 @@ def chosen_views(
     found = [(place, view) for place, view in zip(chosen, cut, strict=True) if view is not None]
     views = without_strays([view for _, view in found])
     if views and not alike:
-        points_m = np.concatenate([object_points(view) for view in views])
-        sigmas_m = surface_sigmas_m([(t.track, int(i)) for (t, i), _ in found], points_m)
+        surface = np.concatenate([object_surface(view) for view in views])
+        sigmas_m = surface_sigmas_m([(t.track, int(i)) for (t, i), _ in found], surface)
         views = [replace(v, weight=SURE_M**2 / (SURE_M**2 + s**2)) for v, s in zip(views, sigmas_m)]
     if sum(view.weight for view in views) < LEAST_SEEN:
         raise BadInput(
@@ -100,21 +100,21 @@ def chosen_views(
     return views
 
 
-def surface_sigmas_m(places: Sequence[tuple[ObjectTrack, int]], points_m: Float[Array, "n 3"]) -> Float[Array, " p"]:
-    """For frames of tracks the root mean square, metres, by which points of the body (object frame) are off where the
-    frame's pose puts them, as its covariance says; 0 where that is not known, which is no doubt."""
+def surface_sigmas_m(places: Sequence[tuple[ObjectTrack, int]], surface: Float[Array, "n 2 3"]) -> Float[Array, " p"]:
+    """For frames of tracks the root mean square, metres, by which the body's surface (points and normals, object frame)
+    is off along its normals where the frame's pose puts it, as its covariance says, times the square root of 3: as far
+    as its points are off, if alike in all directions. A round body's turn about its axis moves nothing of its surface.
+    0 where the covariance is not known, which is no doubt."""
     sigmas_m = np.zeros(len(places))
-    if len(points_m) == 0:
+    if len(surface) == 0:
         return sigmas_m
-    mean, squares = points_m.mean(axis=0), points_m.T @ points_m
+    slopes = np.concatenate([np.cross(surface[:, 0], surface[:, 1]), surface[:, 1]], axis=1)
+    squares = slopes.T @ slopes / len(slopes)
     for k, (track, i) in enumerate(places):
         rotation, covariance = track.camera_from_object[i, :3, :3], track.covariance[i]
-        if not np.isfinite(covariance).all():
-            continue
-        middle, second = rotation @ mean, rotation @ squares @ rotation.T / len(points_m)
-        turn, shift, both = covariance[:3, :3], covariance[3:, 3:], covariance[:3, 3:]
-        turned = np.sum(turn * (np.trace(second) * np.eye(3) - second)) - 2 * np.trace(skew(middle) @ both)
-        sigmas_m[k] = np.sqrt(max(turned + np.trace(shift), 0.0))
+        if np.isfinite(covariance).all():
+            in_camera = np.kron(np.eye(2), rotation)
+            sigmas_m[k] = np.sqrt(max(3 * np.sum(covariance * (in_camera @ squares @ in_camera.T)), 0.0))
     return sigmas_m
 
 

@@ -187,6 +187,13 @@ def _without(view: FieldView, stray: Bool[Array, " n"]) -> FieldView:
     return replace(view, depth_m=depth_m)
 
 
+def object_surface(view: FieldView) -> Float[Array, "n 2 3"]:
+    """The view's depth points in the object frame, and the surface's normals there."""
+    v, u = np.nonzero(view.depth_m)
+    normal = view.plane[v, u] / np.maximum(np.linalg.norm(view.plane[v, u], axis=1, keepdims=True), 1e-9)
+    return np.stack([object_points(view), normal @ view.camera_from_object_at_depth[:3, :3]], axis=1)
+
+
 def object_points(view: FieldView) -> Float[Array, "n 3"]:
     """The view's depth points in the object frame."""
     v, u = np.nonzero(view.depth_m)

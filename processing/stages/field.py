@@ -13,7 +13,7 @@ from processing.sensor.noise import DepthNoise
 from processing.store import Done, plain
 from recordings.results.folder import read_shape, read_track, write_shape
 
-VERSION = 14
+VERSION = 15
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from processing.run import Run
 from processing.store import Done, plain
 from recordings.results.folder import read_track, write_shape
 
-VERSION = 10
+VERSION = 11
 DRAFT = 2.0
 """Of a draft the cells are so many times as wide: far narrower than the band around a surface all the same."""
 

@@ -38,22 +38,41 @@ def weights(seen: TossViews, world: Any, alike: bool = False) -> np.ndarray:
     return np.array([view.weight for view in chosen_views([seen], world.camera, LearnConfig(), alike)])
 
 
-def test_points_of_the_body_are_as_far_off_as_poses_drawn_from_the_covariance_put_them(
+def doubted(pose: np.ndarray, covariance: np.ndarray) -> ObjectTrack:
+    status: tuple[Status, ...] = ("tracked",)
+    return ObjectTrack(0, "d455", "object", np.zeros(1, np.int64), pose[None], status, covariance[None])
+
+
+def test_the_surface_is_as_far_off_along_its_normals_as_poses_drawn_from_the_covariance_put_it(
     tiny_world: Any, toss: Any
 ) -> None:
     rng = np.random.default_rng(3)
     pose = (tiny_world.world_from_camera.inverse() @ tiny_world.poses(1)[0]).matrix
     points_m = rng.normal(size=(50, 3)) * (0.05, 0.02, 0.03) + (0.01, 0.06, -0.02)
+    normals = rng.normal(size=(50, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     root = rng.normal(size=(6, 6)) * np.r_[np.full(3, 0.01), np.full(3, 0.001)][:, None]
-    status: tuple[Status, ...] = ("tracked",)
-    track = ObjectTrack(0, "d455", "object", np.zeros(1, np.int64), pose[None], status, (root @ root.T)[None])
+    track = doubted(pose, root @ root.T)
     moved_m2 = []
     for error in rng.normal(size=(4000, 6)) @ root.T:
         turned = rotation_exp(error[:3]) @ pose[:3, :3]
-        moved_m2.append(np.sum((points_m @ (turned - pose[:3, :3]).T + error[3:]) ** 2, axis=1).mean())
-    assert surface_sigmas_m([(track, 0)], points_m)[0] == pytest.approx(np.sqrt(np.mean(moved_m2)), rel=0.03)
+        moved = points_m @ (turned - pose[:3, :3]).T + error[3:]
+        moved_m2.append(np.mean(np.sum(moved * (normals @ pose[:3, :3].T), axis=1) ** 2))
+    surface = np.stack([points_m, normals], axis=1)
+    found = surface_sigmas_m([(track, 0)], surface)[0]
+    assert found == pytest.approx(np.sqrt(3 * np.mean(moved_m2)), rel=0.03)
     unknown = replace(track, covariance=np.full((1, 6, 6), np.nan))
-    assert surface_sigmas_m([(unknown, 0)], points_m)[0] == 0.0
+    assert surface_sigmas_m([(unknown, 0)], surface)[0] == 0.0
+
+
+def test_a_cylinders_turn_about_its_axis_is_no_doubt_about_its_surface() -> None:
+    angle, height = np.random.default_rng(4).uniform((0, -0.1), (2 * np.pi, 0.1), (500, 2)).T
+    normals = np.stack([np.cos(angle), np.sin(angle), np.zeros(500)], axis=1)
+    surface = np.stack([0.03 * normals + height[:, None] * [0, 0, 1], normals], axis=1)
+    about = [doubted(np.eye(4), np.diag([*(w * np.eye(3)[a]), 0, 0, 0])) for a, w in ((2, 4.0), (0, 0.01))]
+    along, across = surface_sigmas_m([(track, 0) for track in about], surface)
+    assert along < 1e-9
+    assert across == pytest.approx(np.sqrt(3 * 0.01 * np.mean((height * normals[:, 1]) ** 2)))
 
 
 def test_sure_views_count_wholly_and_guesses_by_how_far_off_they_may_be(tiny_world: Any, seen: TossViews) -> None:
