@@ -30,7 +30,7 @@ F8, F4, I8 = "float64", "float32", "int64"
 V, M, T, Q = f"{F8}[::1]", f"{F8}[:,::1]", f"{F8}[:,:,::1]", f"{F8}[:,:,:,::1]"
 V4, M4, T4, Q4 = f"{F4}[::1]", f"{F4}[:,::1]", f"{F4}[:,:,::1]", f"{F4}[:,:,:,::1]"
 VI, MI, VB, MB = f"{I8}[::1]", f"{I8}[:,::1]", "boolean[::1]", "boolean[:,::1]"
-MOTION = (V, V, VB, V, V, V, F8, V)
+MOTION = (V, V, VB, V, V, V, V, F8, V)
 ROLL = (T, M, M, M, VI, M, M, M, F8, I8, I8, F8)
 KERNELS: dict[tuple[str, str], list[tuple[str, ...]]] = {
     (SE3, "exponential"): [(V,)],
@@ -51,9 +51,7 @@ KERNELS: dict[tuple[str, str], list[tuple[str, ...]]] = {
     (AZIMUTH, "greedy"): [(I8, M, MI, *MOTION)],
     (AZIMUTH, "variances"): [(VI, M, MI, *MOTION)],
     (AZIMUTH, "energy"): [(VI, M, MI, *MOTION)],
-    (AZIMUTH, "add_appearance_ratio"): [(Q, T, T, MI, V, F8, F8, I8, M)],
     (AZIMUTH, "add_shape_ratio"): [(T, Q, T, MI, F8, F8, I8, M)],
-    (AZIMUTH, "differences"): [(Q, T, MI, VI, I8, F8, M)],
     (CONSISTENCY, "consistency_terms"): [(T, MI, M4, M4, VI, VI, MI, V, V, V, "boolean", T, M, M)],
     (APPEARANCE, "_appearance_at"): [(M4, M, M4, VI, V, V, F8, M)],
     (STEPS, "roll_rows"): [ROLL],

@@ -50,8 +50,8 @@ ROUND_PAIRS_PER_MEASUREMENT = 100.0
 """The same for a body of revolution, whose profile holds the poses."""
 APPEARANCE_GAIN = 0.125
 """Appearance likelihood ratios of neighbouring samples err together: so much of their sum counts."""
-AZIMUTH_APPEARANCE_GAIN, AZIMUTH_SHAPE_GAIN = 0.125, 0.25
-"""The same of neighbouring cells of an unwrapped round body."""
+AZIMUTH_SHAPE_GAIN = 0.25
+"""The same of neighbouring cells of an unwrapped round body: what stands off it."""
 TRACK_COVARIANCE_SCALE = 6.75
 """Covariances of the joint refinement times this: its residuals share more noise than it knows (shading, the depth
 camera's fixed pattern). From the normalised errors on `choose` (22 tosses): with standard deviations 1, 1.5, 2 and 3

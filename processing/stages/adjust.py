@@ -26,7 +26,7 @@ from recordings.geometry import rotation_angle_rad
 from recordings.progress import Silent
 from recordings.results.folder import read_shape, read_track, write_track
 
-VERSION = 10
+VERSION = 11
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,5 @@
-"""Compiled search over a round body's azimuths: log ratios of two unwrapped views for each azimuth between them, and
-the moves that lower what all pairs and the change of spin cost together.
+"""Compiled search over a round body's azimuths: log ratios of two unwrapped views' shape for each azimuth between them,
+and the moves that lower what all pairs and the change of spin cost together.
 
 Azimuths are whole cells of the unwrapping. A view turned by `state` cells shows at angle a what was unwrapped at a +
 state; so a pair's cost depends on the difference of the two states.
@@ -12,40 +12,8 @@ from typing import no_type_check
 import numpy as np
 from numba import njit
 
-LEAST_SURE, MOST_SURE = 1.0, 4.0
-"""Pixels of a cell; more than the second count no more."""
-RAMPS = (2, 3, 4, 6, 8, 12)
+RAMPS = (2, 3, 4, 6, 8, 12, 18, 27)
 """Over so many views a rotation may grow."""
-
-
-@no_type_check
-@njit(cache=True, nogil=True, fastmath=True)
-def add_appearance_ratio(appearance, count, usual, pairs, sigma, outlier, dead, reach, out):
-    """Adds to out (m, 2 reach + 1) the log ratio of each pair's cells matching at that azimuth to cells matching at
-    random within their row (`usual`: log density of a cell's appearance in its row). Ratios below `dead` are chance."""
-    cells = appearance.shape[2]
-    norm = -np.log(4.0 * np.pi * sigma[0] * sigma[1])
-    low = np.log((np.exp(-dead) - outlier) / (1.0 - outlier))
-    high = np.log((np.exp(dead) - outlier) / (1.0 - outlier))
-    for m in range(pairs.shape[0]):
-        i, j = pairs[m, 0], pairs[m, 1]
-        for r in range(appearance.shape[1]):
-            for a in range(cells):
-                if count[i, r, a] < LEAST_SURE:
-                    continue
-                for q in range(-reach, reach + 1):
-                    b = (a - q) % cells
-                    if count[j, r, b] < LEAST_SURE:
-                        continue
-                    one = (appearance[i, r, a, 0] - appearance[j, r, b, 0]) / sigma[0]
-                    two = (appearance[i, r, a, 1] - appearance[j, r, b, 1]) / sigma[1]
-                    match = norm - 0.25 * (one * one + two * two) - 0.5 * (usual[i, r, a] + usual[j, r, b])
-                    if low < match < high:
-                        continue
-                    ratio = np.log((1.0 - outlier) * np.exp(min(match, 8.0)) + outlier)
-                    ratio -= dead if ratio > 0 else -dead
-                    weight = np.sqrt(min(count[i, r, a], MOST_SURE) * min(count[j, r, b], MOST_SURE)) / MOST_SURE
-                    out[m, q + reach] += weight * ratio
 
 
 @no_type_check
@@ -74,40 +42,18 @@ def add_shape_ratio(odd, sides, free, pairs, match, clash, reach, out):
 
 
 @no_type_check
-@njit(cache=True, nogil=True)
-def differences(appearance, count, pairs, state, every, width, out):
-    """Histogram (2, bins) of the differences of appearance between a pair's cells at the azimuth in `state`, or at
-    every so many azimuths where `every` is not 0."""
-    cells, bins = appearance.shape[2], out.shape[1]
-    for m in range(pairs.shape[0]):
-        i, j = pairs[m, 0], pairs[m, 1]
-        here = (state[i] - state[j]) % cells
-        for q in range(cells):
-            if (every == 0 and q != here) or (every > 0 and q % every != 0):
-                continue
-            for r in range(appearance.shape[1]):
-                for a in range(cells):
-                    b = (a - q) % cells
-                    if count[i, r, a] < 2 or count[j, r, b] < 2:
-                        continue
-                    for c in range(2):
-                        at = int(abs(appearance[i, r, a, c] - appearance[j, r, b, c]) / width)
-                        out[c, min(at, bins - 1)] += 1
-
-
-@no_type_check
 @njit(cache=True, nogil=True, fastmath=True)
-def spin_cost(state, base, steps_s, still, spin_weight, expected, slack, step, motion, a, b):
+def spin_cost(state, base, steps_s, still, spin_weight, usual, expected, slack, step, motion, a, b):
     """Cost of the changes of spin within the views a..b. base (v-1): turn about the axis from view to view at state 0
-    (rad); still (v): whether a view stands for frames without motion; spin_weight (v); expected, slack (v-1): expected
-    turn and its standard deviation (infinite where nothing is expected); motion: usual change, fast spin, cost of
-    faster."""
-    usual, fast, dear = motion[0], motion[1], motion[2]
+    (rad); still (v): whether a view stands for frames without motion; spin_weight, usual (v): of a change there;
+    expected, slack (v-1): expected turn and its standard deviation (infinite where nothing is expected); motion: fast
+    spin, cost of faster."""
+    fast, dear = motion[0], motion[1]
     total, last, known = 0.0, 0.0, False
     for t in range(a, b + 1):
         if still[t]:
             if known:
-                total += spin_weight[t] * np.log(1.0 + (last / usual) ** 2)
+                total += spin_weight[t] * np.log(1.0 + (last / usual[t]) ** 2)
             last, known = 0.0, True
         if t == b:
             break
@@ -118,7 +64,7 @@ def spin_cost(state, base, steps_s, still, spin_weight, expected, slack, step, m
         total += np.log(1.0 + (off / slack[t]) ** 2)
         rate = turn / steps_s[t]
         if known:
-            total += spin_weight[t] * np.log(1.0 + ((rate - last) / usual) ** 2)
+            total += spin_weight[t] * np.log(1.0 + ((rate - last) / usual[t]) ** 2)
         total += dear * max(abs(rate) / fast - 1.0, 0.0)
         last, known = rate, True
     return total
@@ -126,9 +72,9 @@ def spin_cost(state, base, steps_s, still, spin_weight, expected, slack, step, m
 
 @no_type_check
 @njit(cache=True, nogil=True, fastmath=True)
-def energy(state, costs, pairs, base, steps_s, still, spin_weight, expected, slack, step, motion):
+def energy(state, costs, pairs, base, steps_s, still, spin_weight, usual, expected, slack, step, motion):
     """What the pairs (costs (m, cells), cyclic) and the changes of spin cost together."""
-    total = spin_cost(state, base, steps_s, still, spin_weight, expected, slack, step, motion, 0, len(state) - 1)
+    total = spin_cost(state, base, steps_s, still, spin_weight, usual, expected, slack, step, motion, 0, len(state) - 1)
     for m in range(pairs.shape[0]):
         total += costs[m, (state[pairs[m, 0]] - state[pairs[m, 1]]) % costs.shape[1]]
     return total
@@ -163,7 +109,7 @@ def _ramp(state, a, length, q, cells, trial, b):
 @njit(cache=True, nogil=True, fastmath=True)
 def _ramp_costs(state, a, length, costs, pairs, rest, out, trial):
     """Into out (cells): what the pairs and the changes of spin that a ramp changes cost, by how far it turns."""
-    base, steps_s, still, spin_weight, expected, slack, step, motion = rest
+    base, steps_s, still, spin_weight, usual, expected, slack, step, motion = rest
     v, cells = len(state), costs.shape[1]
     out[:] = 0.0
     for m in range(pairs.shape[0]):
@@ -179,16 +125,18 @@ def _ramp_costs(state, a, length, costs, pairs, rest, out, trial):
     trial[lo : hi + 1] = state[lo : hi + 1]
     for q in range(cells):
         _ramp(state, a, length, q, cells, trial, hi)
-        out[q] += spin_cost(trial, base, steps_s, still, spin_weight, expected, slack, step, motion, lo, hi)
+        out[q] += spin_cost(trial, base, steps_s, still, spin_weight, usual, expected, slack, step, motion, lo, hi)
 
 
 @no_type_check
 @njit(cache=True, nogil=True, fastmath=True)
-def descend(state, costs, pairs, base, steps_s, still, spin_weight, expected, slack, step, motion, sweeps, longest):
+def descend(
+    state, costs, pairs, base, steps_s, still, spin_weight, usual, expected, slack, step, motion, sweeps, longest
+):
     """Turns runs of views, ends of the toss, and ends reached by a ramp, until none wants to turn; view 0 stays."""
     v, cells = len(state), costs.shape[1]
     out, trial = np.zeros(cells), state.copy()
-    rest = base, steps_s, still, spin_weight, expected, slack, step, motion
+    rest = base, steps_s, still, spin_weight, usual, expected, slack, step, motion
     for _ in range(sweeps):
         changed = False
         for length in range(longest):
@@ -203,7 +151,7 @@ def descend(state, costs, pairs, base, steps_s, still, spin_weight, expected, sl
                 for q in range(cells):
                     trial[a : min(b, hi) + 1] = (state[a : min(b, hi) + 1] + q) % cells
                     e = out[q] + spin_cost(
-                        trial, base, steps_s, still, spin_weight, expected, slack, step, motion, lo, hi
+                        trial, base, steps_s, still, spin_weight, usual, expected, slack, step, motion, lo, hi
                     )
                     if q == 0 or e < least - 1e-9:
                         best, least = q, e
@@ -226,7 +174,7 @@ def descend(state, costs, pairs, base, steps_s, still, spin_weight, expected, sl
 
 @no_type_check
 @njit(cache=True, nogil=True, fastmath=True)
-def greedy(v, costs, pairs, base, steps_s, still, spin_weight, expected, slack, step, motion):
+def greedy(v, costs, pairs, base, steps_s, still, spin_weight, usual, expected, slack, step, motion):
     """Each view where those before want it."""
     cells = costs.shape[1]
     state, e = np.zeros(v, np.int64), np.zeros(cells)
@@ -241,7 +189,7 @@ def greedy(v, costs, pairs, base, steps_s, still, spin_weight, expected, slack, 
         for q in range(cells):
             state[t] = q
             lo = max(t - 2, 0)
-            e[q] += spin_cost(state, base, steps_s, still, spin_weight, expected, slack, step, motion, lo, t)
+            e[q] += spin_cost(state, base, steps_s, still, spin_weight, usual, expected, slack, step, motion, lo, t)
             if e[q] < e[best]:
                 best = q
         state[t] = best
@@ -250,12 +198,12 @@ def greedy(v, costs, pairs, base, steps_s, still, spin_weight, expected, slack, 
 
 @no_type_check
 @njit(cache=True, nogil=True, fastmath=True)
-def variances(state, costs, pairs, base, steps_s, still, spin_weight, expected, slack, step, motion):
+def variances(state, costs, pairs, base, steps_s, still, spin_weight, usual, expected, slack, step, motion):
     """Variance (rad^2) of each view's azimuth against view 0: the widest of the moves that turn it, each with the
     probability that its energy leaves it."""
     v, cells = len(state), costs.shape[1]
     out, trial, e, var = np.zeros(cells), state.copy(), np.zeros(cells), np.zeros(v)
-    rest = base, steps_s, still, spin_weight, expected, slack, step, motion
+    rest = base, steps_s, still, spin_weight, usual, expected, slack, step, motion
     for length in range(v):
         for a in range(1, v):
             b = v - 1 if length == 0 else a + length - 1
@@ -267,7 +215,7 @@ def variances(state, costs, pairs, base, steps_s, still, spin_weight, expected, 
             for q in range(cells):
                 trial[a : min(b, hi) + 1] = (state[a : min(b, hi) + 1] + q) % cells
                 e[q] = out[q] + spin_cost(
-                    trial, base, steps_s, still, spin_weight, expected, slack, step, motion, lo, hi
+                    trial, base, steps_s, still, spin_weight, usual, expected, slack, step, motion, lo, hi
                 )
             _widen(var, e, a, b, 1, step)
     for length in RAMPS:

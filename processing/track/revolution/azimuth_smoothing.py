@@ -32,7 +32,9 @@ class SteadyConfig:
 
     flight_rad_s: float = 0.3
     other_rad_s: float = 1.5
-    """In a hand, on the table; impacts are outliers (Cauchy)."""
+    """In a hand, on the table (Cauchy)."""
+    free_rad_s: float = 34.6
+    """At a release and an impact anything may happen, up to what hardly shows (`FlightConfig.most_turn_deg`)."""
     steps: int = 40
     tails: float = 3.0
     """Those changes have heavy tails: azimuths err by this times what the usual ones make (28 simulated tosses)."""
@@ -53,13 +55,14 @@ class SteadyConfig:
 @dataclass(frozen=True, eq=False)
 class Pace:
     """Between views: turn about the axis so far (v-1) and seconds, and the turns that rolling on the table or a hand
-    lets expect; of views: whether it stands for frames without motion, whether it flies, and the weight of a change of
-    spin there."""
+    lets expect; of views: whether it stands for frames without motion, whether it flies or is where a flight begins or
+    ends, and the weight of a change of spin there."""
 
     base_rad: Float[Array, " r"]
     steps_s: Float[Array, " r"]
     still: Bool[Array, " v"]
     flies: Bool[Array, " v"]
+    meets: Bool[Array, " v"]
     spin_weight: Float[Array, " v"]
     expected: ExpectedSteps
 
@@ -83,9 +86,11 @@ def pace_of(
         change = (x[2] - x[1]) / steps_s[n] - (x[1] - x[0]) / steps_s[n - 1]
         change = change - 0.5 * (steps_s[n] + steps_s[n - 1]) * scene.gravity_camera_m_s2
         flies[n] = not still[n] and np.linalg.norm(change) < config.flight_m_s
+    beside = np.pad(flies, 1)
+    meets = ~flies & ~still & (beside[:-2] | beside[2:])
     spin_weight = np.where(flies, config.flight_weight, 1.0)
     expected = _carried(scene, views, body, rolled(body, steps_s, config.roll), config)
-    return Pace(base, steps_s, still, flies, spin_weight, expected)
+    return Pace(base, steps_s, still, flies, meets, spin_weight, expected)
 
 
 def _carried(
@@ -125,7 +130,7 @@ def steadied(
         H, g = H + standing[0], g + standing[1] + standing[0] @ angle
         for view, change, slope in _changes(angle, pace):
             usual = config.flight_rad_s if pace.flies[view] else config.other_rad_s
-            usual *= STARTING if pace.still[view] else 1.0
+            usual = config.free_rad_s if pace.meets[view] else usual * (STARTING if pace.still[view] else 1.0)
             weight = pace.spin_weight[view] / (1 + (change / (2 * usual)) ** 2) / usual**2
             g += weight * change * slope
             H += weight * np.outer(slope, slope)

@@ -43,6 +43,8 @@ class UnwrappingConfig:
     """Of the pixels, one in so many is used to fit the light."""
     robust: float = 1.5
     """Residuals of the light beyond so many standard deviations belong to the object."""
+    normals: int = 24
+    """Bins across the normals that face the camera (8 degrees)."""
     slow_deg: float = 30.0
     slow_rows: int = 5
     """A change of appearance over more than so many degrees and rows is the light's."""
@@ -60,6 +62,7 @@ class UnwrappingConfig:
 @dataclass(frozen=True, eq=False)
 class Unwrapped:
     """`appearance` (v, r, c, 2): two differences of colour without the light, mean per cell; `count` (v, r, c): pixels.
+    `lit`, `lit_count`: the same by the surface's normal in camera axes.
     `odd` (v, q, c): share of cells where something stands off the body, `sides` (v, 3, q, c) the same by the side that
     was seen; `free` (v, q, c): 1 where nothing stands. Rows r: outside by height, both ends by radius; q: layers times
     heights; c: angles about the axis. `standing`: per view the pixels of what stands off the body, as samples. `rings`:
@@ -67,6 +70,8 @@ class Unwrapped:
 
     appearance: Float[Array, "v r c 2"]
     count: Float[Array, "v r c"]
+    lit: Float[Array, "v b 2"]
+    lit_count: Float[Array, "v b"]
     odd: Float[Array, "v q c"]
     sides: Float[Array, "v 3 q c"]
     free: Float[Array, "v q c"]
@@ -111,6 +116,7 @@ def unwrap(
     mean, count = np.zeros((len(views), rows, cells, 2)), np.zeros((len(views), rows, cells))
     odd = np.zeros((len(views), 3, layers * heights, cells))
     free = np.zeros((len(views), layers * heights, cells))
+    lit, lit_count = np.zeros((len(views), config.normals**2, 2)), np.zeros((len(views), config.normals**2))
     standing = []
     for n, (i, p) in enumerate(zip(views, seen)):
         cell = np.floor((p.angle + np.pi) / (2 * np.pi) * cells).astype(int) % cells
@@ -119,17 +125,28 @@ def unwrap(
         use = (row >= 0) & ~shines
         np.add.at(count[n], (row[use], cell[use]), 1)
         np.add.at(mean[n], (row[use], cell[use]), left[use])
+        bins = _normal_bins(p.normal_camera[use], config.normals)
+        np.add.at(lit_count[n], bins, 1)
+        np.add.at(lit[n], bins, left[use] - left[use].mean(0) if use.any() else left[use])
         window_m = float(config.window_px * scene.store.center_m[i][2] / scene.store.rectified.focal[0])
         height, layer, side, off = _off(p, profile, low, window_m, config)
         np.add.at(odd[n], (side[off], layer[off] * heights + height[off], cell[off]), 1)
         free[n] = _free(scene, int(i), poses[i], axis, profile, low, cells, config)
         standing.append(p.samples[off])
     mean /= np.maximum(count, 1)[..., None]
+    lit /= np.maximum(lit_count, 1)[..., None]
     mean = np.array([_without_slow_changes(m, c, config) for m, c in zip(mean, count)])
     anyhow = np.minimum(odd.sum(1), 3) / 3
     rings = np.column_stack([np.clip(low + (np.arange(heights) + 0.5) * config.row_m, low, high), profile])
     rings = np.concatenate([[[low, profile[0]]], rings, [[high, profile[-1]]]])
-    return Unwrapped(mean, count, anyhow, np.minimum(odd, 3) / 3, free * (anyhow == 0), standing, rings)
+    return Unwrapped(mean, count, lit, lit_count, anyhow, np.minimum(odd, 3) / 3, free * (anyhow == 0), standing, rings)
+
+
+def _normal_bins(normal: Float[Array, "p 3"], bins: int) -> Int[Array, " p"]:
+    """The normals towards the camera in a square of bins of equal area (Lambert's projection)."""
+    scale = np.sqrt(1 / np.maximum(1 - normal[:, 2], 1e-6))
+    at = np.clip(((scale[:, None] * normal[:, :2] + 1) / 2 * bins).astype(int), 0, bins - 1)
+    return np.asarray(at[:, 1] * bins + at[:, 0])
 
 
 def _without_slow_changes(
@@ -143,22 +160,6 @@ def _without_slow_changes(
     window = 2 * wide + 1, config.slow_rows
     around = cv2.boxFilter(padded, -1, window, normalize=False, borderType=cv2.BORDER_CONSTANT)[:, wide:-wide]
     return np.where(seen > 0, mean - around[..., :2] / np.maximum(around[..., 2:], 1.0), 0.0)
-
-
-def usual_appearance(unwrapped: Unwrapped, sigma: Float[Array, "2"]) -> Float[Array, "v r c"]:
-    """Log density of each cell's appearance among all that its row shows: an azimuth only shuffles a row."""
-    out = np.zeros(unwrapped.count.shape)
-    for r in range(unwrapped.count.shape[1]):
-        use = unwrapped.count[:, r] > 0
-        if use.sum() < 5:
-            continue
-        seen = unwrapped.appearance[:, r][use]
-        at = np.clip(np.round((seen - np.median(seen, axis=0)) / sigma) + 30, 0, 60).astype(int)
-        shares = np.zeros((61, 61))
-        np.add.at(shares, (at[:, 0], at[:, 1]), 1.0 / len(at))
-        dense = 0.97 * cv2.GaussianBlur(shares, (0, 0), float(np.sqrt(2.0))) + 0.03 / shares.size
-        out[:, r][use] = np.log(dense[at[:, 0], at[:, 1]] / (sigma[0] * sigma[1]))
-    return out
 
 
 def across(axis: Axis) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
