@@ -26,7 +26,11 @@ from recordings.geometry import rotation_angle_rad
 from recordings.progress import Silent
 from recordings.results.folder import read_shape, read_track, write_track
 
-VERSION = 11
+VERSION = 12
+
+AS_WELL = 1.2
+"""An unsure frame fits as well as sure ones where it costs no more than so many times what the worst of them does
+(docs/decisions/tracked.md)."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +63,7 @@ def adjust(run: Run, tracks: Mapping[int, Done], shape: Done, images: Mapping[in
         config = run.config.track
         all_after = adjusted(tosses, body, config.hypotheses, run.progress("poses with the surface free"))
         turns, shifts = [], []
-        limit = fit_of_sure([*before.values()], [a.cost for a in all_after]) if len(tosses) > 1 else -1.0
+        limit = AS_WELL * fit_of_sure([*before.values()], [a.cost for a in all_after]) if len(tosses) > 1 else -1.0
         for toss, track, after in zip(tosses, before.values(), all_after, strict=True):
             steps = np.linalg.inv(track.camera_from_object[~track.lost]) @ after.poses[~track.lost]
             turns += [float(np.degrees(rotation_angle_rad(step[:3, :3]))) for step in steps]
