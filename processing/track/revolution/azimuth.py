@@ -75,10 +75,8 @@ class AzimuthConfig:
     is seen in few views (a finger, depth that runs on to the table) and counts the less, by the third power."""
     spin_change_rad_s: float = 1.5
     """Usual change of spin from view to view, on the grid."""
-    fast_rad_s: float = 34.6
     fast_cost: float = 100.0
-    """Spins above this cost their excess times this: 66 degrees a frame at 30 Hz, beyond which hardly anything
-    seen in one frame is seen in the next (`FlightConfig.most_turn_deg`)."""
+    """Spins faster than `SteadyConfig.fast_rad_s` cost their excess times this."""
     sweeps: int = 8
     longest: int = 12
     """Views of a run that are turned together."""
@@ -200,8 +198,8 @@ def _weighed(
     shape = np.minimum(_above_least(shape), config.most_shape)
     standing = min(float(shape.mean()) / (config.standing_share * config.most_shape), 1.0) ** 3
     shape = standing * (shape + _sunk(body, unwrapped, frames, step * np.arange(config.cells), config))
-    usual = np.where(pace.meets, config.steady.free_rad_s, config.spin_change_rad_s)
-    motion = np.array([config.fast_rad_s, config.fast_cost])
+    usual = np.where(pace.meets, config.steady.fast_rad_s, config.spin_change_rad_s)
+    motion = np.array([config.steady.fast_rad_s, config.fast_cost])
     expected = pace.expected.step_rad, pace.expected.sigma_rad
     rest = (frames.pairs, pace.base_rad, pace.steps_s, pace.still, pace.spin_weight, usual, *expected, step, motion)
     return appearance, shape, standing, rest

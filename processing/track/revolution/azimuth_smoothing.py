@@ -33,8 +33,9 @@ class SteadyConfig:
     flight_rad_s: float = 0.3
     other_rad_s: float = 1.5
     """In a hand, on the table (Cauchy)."""
-    free_rad_s: float = 34.6
-    """At a release and an impact anything may happen, up to what hardly shows (`FlightConfig.most_turn_deg`)."""
+    fast_rad_s: float = 34.6
+    """At a release and an impact, up to this: 66 degrees a frame at 30 Hz, beyond which hardly anything seen in one
+    frame is seen in the next (`FlightConfig.most_turn_deg`)."""
     steps: int = 40
     tails: float = 3.0
     """Those changes have heavy tails: azimuths err by this times what the usual ones make (28 simulated tosses)."""
@@ -130,7 +131,7 @@ def steadied(
         H, g = H + standing[0], g + standing[1] + standing[0] @ angle
         for view, change, slope in _changes(angle, pace):
             usual = config.flight_rad_s if pace.flies[view] else config.other_rad_s
-            usual = config.free_rad_s if pace.meets[view] else usual * (STARTING if pace.still[view] else 1.0)
+            usual = config.fast_rad_s if pace.meets[view] else usual * (STARTING if pace.still[view] else 1.0)
             weight = pace.spin_weight[view] / (1 + (change / (2 * usual)) ** 2) / usual**2
             g += weight * change * slope
             H += weight * np.outer(slope, slope)
