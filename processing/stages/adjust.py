@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from numpy import ndarray as Array
 
 from processing.engine.parts import side_by_side
@@ -26,7 +26,7 @@ from recordings.geometry import rotation_angle_rad
 from recordings.progress import Silent
 from recordings.results.folder import read_shape, read_track, write_track
 
-VERSION = 12
+VERSION = 13
 
 AS_WELL = 1.2
 """An unsure frame fits as well as sure ones where it costs no more than so many times what the worst of them does
@@ -69,19 +69,16 @@ def adjust(run: Run, tracks: Mapping[int, Done], shape: Done, images: Mapping[in
             turns += [float(np.degrees(rotation_angle_rad(step[:3, :3]))) for step in steps]
             shifts += [float(x) for x in np.linalg.norm(steps[:, :3, 3], axis=1)]
             held = after.cost <= limit
-            asked = held & np.array([s != "tracked" for s in track.status])
-            doubt = azimuth_covariance(toss.scene, after, asked, config.hypotheses)
+            doubt = azimuth_covariance(toss.scene, after, config.hypotheses)
             write_track(folder, reflagged(track, after.poses, after.covariance, after.cost, held, doubt, config.flags))
         return AdjustResult(len(turns), float(np.median(turns or [0.0])), float(np.median(shifts or [0.0])))
 
     return run.store.run("adjust", VERSION, run.config.track, inputs, AdjustResult, compute)
 
 
-def azimuth_covariance(
-    scene: Scene, after: AdjustedToss, asked: Bool[Array, " n"], config: HypothesisConfig
-) -> Float[Array, "n 6 6"]:
+def azimuth_covariance(scene: Scene, after: AdjustedToss, config: HypothesisConfig) -> Float[Array, "n 6 6"]:
     """What the adjusted views of a body that looks round leave open of its azimuth (twist of the object frame); zero of
-    other bodies, and where no frame is `asked` about."""
+    other bodies."""
     use = np.isfinite(after.cost)
-    found = open_azimuths(scene, after.poses, use, int(use.argmax()), config) if asked.any() else None
+    found = open_azimuths(scene, after.poses, use, int(use.argmax()), config) if use.any() else None
     return np.zeros((len(use), 6, 6)) if found is None else found.covariance

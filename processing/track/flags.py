@@ -193,14 +193,13 @@ def reflagged(
 ) -> ObjectTrack:  # fmt: skip
     """The track at poses that were solved for anew, with their covariances (twist of the object frame) and what each
     view costs there. Frames that took no part (NaN) or fit nothing are as unsure as they were. So are unsure ones that
-    no other toss's frames have `held`: one solution knows nothing of the others that left them open. Those that are
-    held keep the doubt about a round body's `azimuth` (its covariance), which no frame tells.
+    no other toss's frames have `held`: one solution knows nothing of the others that left them open. What is left open
+    of a round body's `azimuth` (its covariance) no single frame tells: all have it.
     """
     status, covariance = list(track.status), track.covariance.copy()
     sure = np.array([s == "tracked" for s in status])
     for i in np.flatnonzero((sure | held) & (cost <= config.tracked_cost)):
-        left = 0.0 if sure[i] else azimuth[i]
-        covariance[i] = camera_covariance(poses[i], config.correlated * twists[i] + left)
+        covariance[i] = camera_covariance(poses[i], config.correlated * twists[i] + azimuth[i])
         status[i] = _status(covariance[i], config)
     return replace(track, camera_from_object=poses, covariance=covariance, status=tuple(status))
 

@@ -144,17 +144,16 @@ def test_poses_that_were_solved_for_anew_are_as_sure_as_their_new_covariances() 
 
 
 def test_other_tosses_do_not_decide_about_an_azimuth_that_no_frame_tells() -> None:
-    """Frames: the azimuth known before; open before, and now; open before, known now."""
+    """Frames: the azimuth known before, open now; open before, and now; open before, known now."""
     poses, axis = np.tile(np.eye(4), (3, 1, 1)), np.array([0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
     doubt = np.radians([40.0, 40.0, 2.0])[:, None, None] ** 2 * np.outer(axis, axis)
     status = ("tracked", "interpolated", "interpolated")
     before = ObjectTrack(0, "d455", "object", np.arange(3, dtype=np.int64), poses, status, np.tile(doubt[0], (3, 1, 1)))
     twists = np.tile(np.diag([1e-3] * 3 + [0.01] * 3) ** 2, (3, 1, 1))
     found = reflagged(before, poses, twists, np.full(3, 0.1), np.ones(3, dtype=bool), doubt, FlagConfig())
-    assert found.status == ("tracked", "interpolated", "tracked")
+    assert found.status == ("interpolated", "interpolated", "tracked")
     spread_deg = np.degrees(np.sqrt(found.covariance[:, 2, 2]))
-    assert spread_deg[0] < 2
-    assert spread_deg[1] > 39
+    assert spread_deg[:2].min() > 39
     assert 2 < spread_deg[2] < 3
 
 
