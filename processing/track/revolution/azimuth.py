@@ -1,10 +1,11 @@
 """A round body's azimuth about its axis: sought over all frames at once, because no single frame fixes it.
 
 Where the depth of all frames leaves one rotation open (a mug's, a can's), the views are unwrapped about the axis and
-every pair is compared over the whole circle: does what stands off the body fall into a place that was seen empty, do
-colours that are rare at their height meet. The measure is a log likelihood ratio against a random azimuth, so that a
-body of one colour leaves it open and a small label fixes it. The azimuths of all frames are those that cost least
-together with the changes of spin: first on a grid (azimuth_kernels.py), then off it (azimuth_smoothing.py).
+every pair is compared over the whole circle: does what stands off the body fall into a place that was seen empty, does
+what is printed correlate (print_match.py). Both are log likelihood ratios against a random azimuth, so that a body of
+one colour leaves it open and a small label fixes it, and count as far as they do not contradict themselves. The
+azimuths of all frames are those that cost least together with the changes of spin: first on a grid
+(azimuth_kernels.py), then off it (azimuth_smoothing.py).
 """
 
 from __future__ import annotations
