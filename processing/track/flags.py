@@ -265,21 +265,18 @@ def with_shape_error(track: ObjectTrack, alone: ObjectTrack, held: bool) -> Obje
     return replace(track, covariance=covariance)
 
 
-HELD_DRIFT = 1 / 8
-"""Power of the drift of turns that other tosses leave: docs/decisions/tracked.md has the curve."""
+HELD_DRIFT = 0.5
+"""Power of the drift that other tosses leave: docs/decisions/tracked.md has the curve."""
 
 
 def with_drift(track: ObjectTrack, coarseness: float, held: bool) -> ObjectTrack:
     """The track, its covariances as many times as large as means over the session's depth vary more than over fine
-    depth (`DepthNoise.coarseness`); those of turns by its power `HELD_DRIFT` where other tosses' frames hold it.
+    depth (`DepthNoise.coarseness`); by its root where other tosses' frames hold it.
 
     The joint refinement knows how depth errs. But where it is coarse, chains of views slip, each pair of which still
-    fits, and no covariance about one solution shows it. What other tosses show of the object ends most such chains; but
-    what depth errs by in all of them alike still moves places.
+    fits, and no covariance about one solution shows it. What other tosses show of the object ends most such chains.
     """
-    times = max(1.0, coarseness)
-    growth = np.sqrt([times ** (HELD_DRIFT if held else 1.0)] * 3 + [times] * 3)
-    return replace(track, covariance=track.covariance * growth[:, None] * growth)
+    return replace(track, covariance=track.covariance * max(1.0, coarseness) ** (HELD_DRIFT if held else 1.0))
 
 
 def published(track: ObjectTrack) -> ObjectTrack:
