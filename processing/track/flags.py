@@ -265,13 +265,13 @@ def with_shape_error(track: ObjectTrack, alone: ObjectTrack, held: bool) -> Obje
     return replace(track, covariance=covariance)
 
 
-HELD_DRIFT = 0.5
+HELD_DRIFT = 1 / 3
 """Power of the drift that other tosses leave: docs/decisions/tracked.md has the curve."""
 
 
 def with_drift(track: ObjectTrack, coarseness: float, held: bool) -> ObjectTrack:
     """The track, its covariances as many times as large as means over the session's depth vary more than over fine
-    depth (`DepthNoise.coarseness`); by its root where other tosses' frames hold it.
+    depth (`DepthNoise.coarseness`); by its cube root where other tosses' frames hold it.
 
     The joint refinement knows how depth errs. But where it is coarse, chains of views slip, each pair of which still
     fits, and no covariance about one solution shows it. What other tosses show of the object ends most such chains.

@@ -23,7 +23,7 @@ from recordings.results.folder import RobotMasks, read_masks, read_track, write_
 from recordings.results.track_notes import FIT, NOTES
 from recordings.tracks import ObjectTrack
 
-VERSION = 11
+VERSION = 12
 
 
 @dataclass(frozen=True)
