@@ -37,6 +37,8 @@ SPOILED_NATS = SURE_NATS + float(np.log(7.0))
 """What must speak against the adjustment of a toss: of sixteen (generated sessions) it made two worse by a degree."""
 FAR_BETTER = 0.5 * float(np.log(2.0) / ALIKE) ** 2
 """Nats of half the residuals: a toss that lies right on a shape fits hardly worse than it does alone."""
+ADJUSTMENTS, STILL_DEG = 4, 1.0
+"""All poses are adjusted so often at most, and no longer once half of them turn by less than this."""
 FOLDS = 3
 """Into so many parts many tosses are split, each tracked on the others' shape; fewer tosses are left out singly."""
 
@@ -98,19 +100,24 @@ def unbent(run: Run, toss: int, together: Done, alone: Done, images: Images) -> 
 
 
 def with_free_surface(run: Run, tracks: Mapping[int, Done], images: Mapping[int, Images]) -> dict[int, Done]:
-    """The tracks after one adjustment of all of them with the surface that they show free; those of tosses that it
-    surely spoiled, as they were."""
-    shape = fused(run, tracks, images, draft=True)
-    if shape is None:
-        return dict(tracks)
-    after = adjust(run, tracks, shape, images)
+    """The tracks after adjustments of all of them with the surface that they show free, for as long as these still turn
+    them; those of tosses that one surely spoiled, as they were before it."""
+    found = dict(tracks)
+    for _ in range(ADJUSTMENTS):
+        shape = fused(run, found, images, draft=True)
+        if shape is None:
+            break
+        before, after = found, adjust(run, found, shape, images)
 
-    def stays(toss: int) -> bool:
-        was, now = (TrackResiduals(on_itself(run, done, images[toss]), None) for done in (tracks[toss], after))
-        return was.surely_better(now, SPOILED_NATS)
+        def stays(toss: int, before: Mapping[int, Done] = before, after: Done = after) -> bool:
+            was, now = (TrackResiduals(on_itself(run, done, images[toss]), None) for done in (before[toss], after))
+            return was.surely_better(now, SPOILED_NATS)
 
-    kept = each(run, tracks, stays)
-    return {t: done if kept[t] else after for t, done in tracks.items()}
+        kept = each(run, before, stays)
+        found = {t: done if kept[t] else after for t, done in before.items()}
+        if after.result.rotation_deg < STILL_DEG:
+            break
+    return found
 
 
 def own_misfits(run: Run, tracks: Mapping[int, Done], images: Mapping[int, Images]) -> dict[int, float]:

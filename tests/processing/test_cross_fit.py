@@ -15,6 +15,7 @@ from processing.pipeline import cross_fit, first_pass
 from processing.pipeline.start import start_run
 from processing.refine.image_residuals import Explained
 from processing.run import Run
+from processing.stages.adjust import AdjustResult
 from processing.stages.carry import carried
 from processing.stages.track import TrackResult
 from processing.store import Done
@@ -133,10 +134,30 @@ def test_a_toss_that_the_adjustment_spoils_stays_as_it_was(
 ) -> None:
     tosses = Tosses(tiny_world, tmp_path, 1, frames=16)
     right, wrong = tosses.track(0, 0 * TURN, "right"), tosses.track(0, 2 * TURN, "wrong")
+    right, wrong = (replace(done, result=AdjustResult(16, 0.5, 0.001)) for done in (right, wrong))
     monkeypatch.setattr(cross_fit, "adjust", lambda *_: wrong)
     assert cross_fit.with_free_surface(tosses.run, {0: right}, tosses.images) == {0: right}
     monkeypatch.setattr(cross_fit, "adjust", lambda *_: right)
     assert cross_fit.with_free_surface(tosses.run, {0: wrong}, tosses.images) == {0: right}
+
+
+def test_poses_are_adjusted_again_while_that_turns_them(
+    tiny_world: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tosses = Tosses(tiny_world, tmp_path, 1, frames=16)
+    right = tosses.track(0, 0 * TURN, "right")
+    for turns, calls in (((5.0, 2.0, 0.5, 0.1), 3), ((0.5,), 1), ((9.0,) * 9, cross_fit.ADJUSTMENTS)):
+        asked = iter(turns)
+        seen: list[Any] = []
+
+        def adjusted(_: Any, tracks: Any, *__: Any, asked: Any = asked, seen: list[Any] = seen) -> Any:
+            seen.append(tracks)
+            return replace(right, result=AdjustResult(16, next(asked), 0.0))
+
+        monkeypatch.setattr(cross_fit, "adjust", adjusted)
+        after = cross_fit.with_free_surface(tosses.run, {0: right}, tosses.images)
+        assert len(seen) == calls
+        assert after[0].result.rotation_deg == turns[calls - 1]
 
 
 @pytest.mark.parametrize(("alone_turn", "bent_turn", "kept"), [(0, 2, "carry"), (2, 0, "bent"), (0, 0, "bent")])
