@@ -101,23 +101,32 @@ def unbent(run: Run, toss: int, together: Done, alone: Done, images: Images) -> 
 
 def with_free_surface(run: Run, tracks: Mapping[int, Done], images: Mapping[int, Images]) -> dict[int, Done]:
     """The tracks after adjustments of all of them with the surface that they show free, for as long as these still turn
-    them; those of tosses that one surely spoiled, as they were before it."""
+    them."""
     found = dict(tracks)
     for _ in range(ADJUSTMENTS):
-        shape = fused(run, found, images, draft=True)
-        if shape is None:
-            break
-        before, after = found, adjust(run, found, shape, images)
-
-        def stays(toss: int, before: Mapping[int, Done] = before, after: Done = after) -> bool:
-            was, now = (TrackResiduals(on_itself(run, done, images[toss]), None) for done in (before[toss], after))
-            return was.surely_better(now, SPOILED_NATS)
-
-        kept = each(run, before, stays)
-        found = {t: done if kept[t] else after for t, done in before.items()}
-        if after.result.rotation_deg < STILL_DEG:
+        found, turned_deg = adjusted_once(run, found, tracks, images)
+        if turned_deg < STILL_DEG:
             break
     return found
+
+
+def adjusted_once(
+    run: Run, tracks: Mapping[int, Done], first: Mapping[int, Done], images: Mapping[int, Images]
+) -> tuple[dict[int, Done], float]:
+    """The tracks after one adjustment, those of tosses that it surely spoiled as they were, and by how many degrees it
+    turned them (median; 0 where there is none). `first`: the tracks before any, by which frames are sure."""
+    shape = fused(run, tracks, images, draft=True)
+    if shape is None:
+        return dict(tracks), 0.0
+    after = adjust(run, tracks, first, shape, images)
+
+    def stays(toss: int) -> bool:
+        was, now = (TrackResiduals(on_itself(run, done, images[toss]), None) for done in (tracks[toss], after))
+        return was.surely_better(now, SPOILED_NATS)
+
+    kept = each(run, tracks, stays)
+    turned_deg = 0.0 if all(kept.values()) else after.result.rotation_deg
+    return {t: done if kept[t] else after for t, done in tracks.items()}, turned_deg
 
 
 def own_misfits(run: Run, tracks: Mapping[int, Done], images: Mapping[int, Images]) -> dict[int, float]:

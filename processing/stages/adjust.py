@@ -26,7 +26,7 @@ from recordings.geometry import rotation_angle_rad
 from recordings.progress import Silent
 from recordings.results.folder import read_shape, read_track, write_track
 
-VERSION = 13
+VERSION = 14
 
 AS_WELL = 1.2
 """An unsure frame fits as well as sure ones where it costs no more than so many times what the worst of them does
@@ -42,12 +42,17 @@ class AdjustResult:
     translation_m: float
 
 
-def adjust(run: Run, tracks: Mapping[int, Done], shape: Done, images: Mapping[int, Images]) -> Done[AdjustResult]:
-    """The tracks of tosses in the object frame of `shape`."""
+def adjust(
+    run: Run, tracks: Mapping[int, Done], first: Mapping[int, Done], shape: Done, images: Mapping[int, Images]
+) -> Done[AdjustResult]:
+    """The tracks of tosses in the object frame of `shape`. `first`: the same before any adjustment. Which frames were
+    sure there decides anew which are, so that what fits as well as they do does not widen from one to the next."""
     inputs = {**track_and_image_keys(tracks, images), "surface": shape.key}
+    inputs |= {f"first_{t:02d}": first[t].key for t in tracks}
 
     def compute(folder: Path) -> AdjustResult:
         body, before = read_shape(shape.folder), {t: read_track(done.folder, t) for t, done in tracks.items()}
+        unadjusted = {t: read_track(first[t].folder, t) for t in tracks}
         gravity = gravity_in_camera(None if run.world_from_camera is None else run.world_from_camera.matrix)
 
         def opened(toss: int) -> PosedToss:
@@ -63,14 +68,16 @@ def adjust(run: Run, tracks: Mapping[int, Done], shape: Done, images: Mapping[in
         config = run.config.track
         all_after = adjusted(tosses, body, config.hypotheses, run.progress("poses with the surface free"))
         turns, shifts = [], []
-        limit = AS_WELL * fit_of_sure([*before.values()], [a.cost for a in all_after]) if len(tosses) > 1 else -1.0
-        for toss, track, after in zip(tosses, before.values(), all_after, strict=True):
+        limit = AS_WELL * fit_of_sure([*unadjusted.values()], [a.cost for a in all_after]) if len(tosses) > 1 else -1.0
+        for toss, t, after in zip(tosses, tracks, all_after, strict=True):
+            track = before[t]
             steps = np.linalg.inv(track.camera_from_object[~track.lost]) @ after.poses[~track.lost]
             turns += [float(np.degrees(rotation_angle_rad(step[:3, :3]))) for step in steps]
             shifts += [float(x) for x in np.linalg.norm(steps[:, :3, 3], axis=1)]
             held = after.cost <= limit
             doubt = azimuth_covariance(toss.scene, after, config.hypotheses)
-            write_track(folder, reflagged(track, after.poses, after.covariance, after.cost, held, doubt, config.flags))
+            said = unadjusted[t]
+            write_track(folder, reflagged(said, after.poses, after.covariance, after.cost, held, doubt, config.flags))
         return AdjustResult(len(turns), float(np.median(turns or [0.0])), float(np.median(shifts or [0.0])))
 
     return run.store.run("adjust", VERSION, run.config.track, inputs, AdjustResult, compute)

@@ -141,7 +141,7 @@ def test_a_toss_that_the_adjustment_spoils_stays_as_it_was(
     assert cross_fit.with_free_surface(tosses.run, {0: wrong}, tosses.images) == {0: right}
 
 
-def test_poses_are_adjusted_again_while_that_turns_them(
+def test_poses_are_adjusted_again_while_that_turns_them_and_no_frame_becomes_sure_by_stages(
     tiny_world: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     tosses = Tosses(tiny_world, tmp_path, 1, frames=16)
@@ -150,13 +150,14 @@ def test_poses_are_adjusted_again_while_that_turns_them(
         asked = iter(turns)
         seen: list[Any] = []
 
-        def adjusted(_: Any, tracks: Any, *__: Any, asked: Any = asked, seen: list[Any] = seen) -> Any:
-            seen.append(tracks)
+        def adjusted(_: Any, __: Any, first: Any, *___: Any, asked: Any = asked, seen: list[Any] = seen) -> Any:
+            seen.append(first[0])
             return replace(right, result=AdjustResult(16, next(asked), 0.0))
 
         monkeypatch.setattr(cross_fit, "adjust", adjusted)
         after = cross_fit.with_free_surface(tosses.run, {0: right}, tosses.images)
         assert len(seen) == calls
+        assert all(first is right for first in seen)  # what was sure before any of them decides
         assert after[0].result.rotation_deg == turns[calls - 1]
 
 
