@@ -26,7 +26,7 @@ from recordings.geometry import rotation_angle_rad
 from recordings.progress import Silent
 from recordings.results.folder import read_shape, read_track, write_track
 
-VERSION = 14
+VERSION = 15
 
 AS_WELL = 1.2
 """An unsure frame fits as well as sure ones where it costs no more than so many times what the worst of them does

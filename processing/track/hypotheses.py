@@ -29,7 +29,7 @@ from processing.track.joint_refinement import (
     steady_motion,
 )
 from processing.track.pairs import KnownFigures
-from processing.track.revolution.axis import Axis, open_axis
+from processing.track.revolution.axis import Axis, open_axes
 from processing.track.revolution.azimuth import (
     AzimuthConfig,
     Azimuths,
@@ -38,7 +38,7 @@ from processing.track.revolution.azimuth import (
     inconsistency,
     with_uncertainty,
 )
-from processing.track.revolution.profile import BodyConfig, RoundBody, anchored, is_round
+from processing.track.revolution.profile import BodyConfig, RoundBody, anchored, is_round, laid_on_profile
 from processing.track.schedule import Schedule, rows
 
 
@@ -158,8 +158,12 @@ def _round_axis(
     scene: Scene, poses: Float[Array, "n 4 4"], use: Bool[Array, " n"], config: HypothesisConfig
 ) -> Axis | None:
     """The axis about which views look round; None where they do not."""
-    axis = open_axis(scene, poses, use, config.azimuth.axis)
-    return axis if axis and is_round(scene.store, poses, use, axis, config.body) else None
+    lines = open_axes(scene, poses, use, config.azimuth.axis)
+    laid = [laid_on_profile(scene.store, poses, use, line, config.body) for line in lines]
+    if not laid:
+        return None
+    axis, _ = max(laid, key=lambda found: found[1])
+    return axis if is_round(scene.store, poses, use, axis, config.body) else None
 
 
 def _is_rather_round(

@@ -61,6 +61,9 @@ class BodyConfig:
     """A body is round where so much of its outlines is that of a body of revolution (a box's: a quarter at most)."""
     tries: int = 6
     """Steps after which that is asked."""
+    rounds: int = 2
+    axis_steps: int = 10
+    """Times that a profile is begun, and steps of each, in which the axis is sought for it."""
     least_pixels: int = 12
     """A node that fewer samples saw is unknown."""
 
@@ -207,6 +210,40 @@ class RoundBody:
         H[np.diag_indices(len(g))] += 1e-6 * H.diagonal() + 1.0
 
 
+def laid_on_profile(
+    store: ViewStore, poses: Float[Array, "n 4 4"], use: Bool[Array, " n"], axis: Axis, config: BodyConfig
+) -> tuple[Axis, float]:
+    """The axis near this one about which one profile fits all views at these poses best, and the share of its outlines
+    that is there.
+
+    To move the axis is to move all poses by one twist: their normal equations, summed. Normals alone leave the axis of
+    a body about as high as wide open by many degrees; its outlines, which are even about it, do not.
+    """
+    for _ in range(config.rounds):
+        body, moved = RoundBody(store, poses, use, axis, config), poses.copy()
+        views = np.flatnonzero(use)
+        place = np.full(len(poses), -1)
+        place[views] = np.arange(len(views))
+        along = np.concatenate([axis.direction, np.zeros(3)])
+        kept = np.outer(axis.twist, axis.twist) / float(axis.twist @ axis.twist) + np.outer(along, along)
+        old_from_new = np.eye(4)
+        for _ in range(config.axis_steps):
+            H, g = np.zeros((len(views), len(views), 6, 6)), np.zeros((len(views), 6))
+            body.add(H, g, moved, place)
+            total = H.sum((0, 1))
+            total += np.trace(total) * (1e3 * kept + 1e-9 * np.eye(6))
+            step = se3.inverse(se3.exponential(_at_most(-np.linalg.solve(total, g.sum(0)))))
+            moved, old_from_new = moved @ step, old_from_new @ step
+        axis = axis.seen_from(old_from_new)
+    return axis, body.outline_share
+
+
+def _at_most(twist: Float[Array, "6"]) -> Float[Array, "6"]:
+    """The twist, no longer than .01 m and .1 rad."""
+    size = max(float(np.linalg.norm(twist[:3])) / 0.01, float(np.linalg.norm(twist[3:])) / 0.1, 1.0)
+    return np.asarray(twist / size)
+
+
 def is_round(
     store: ViewStore, poses: Float[Array, "n 4 4"], use: Bool[Array, " n"], axis: Axis, config: BodyConfig
 ) -> bool:
@@ -222,8 +259,7 @@ def is_round(
         H = blocks.transpose(0, 2, 1, 3).reshape(6 * len(views), -1)
         H += np.diag(1e-6 * H.diagonal() + 1e-3) + 1e3 * np.trace(H) / len(H) * turn
         for i, twist in zip(views, -np.linalg.solve(H, g.reshape(-1)).reshape(-1, 6)):
-            size = max(float(np.linalg.norm(twist[:3])) / 0.01, float(np.linalg.norm(twist[3:])) / 0.1, 1.0)
-            poses[i] = poses[i] @ se3.inverse(se3.exponential(twist / size))
+            poses[i] = poses[i] @ se3.inverse(se3.exponential(_at_most(twist)))
     return body.outline_share > config.round_share
 
 

@@ -14,7 +14,7 @@ from processing.sensor.view import Crop, ViewConfig
 from processing.sensor.view_store import ViewStore
 from processing.track.beam import Scene
 from processing.track.revolution import azimuth_kernels as tk
-from processing.track.revolution.axis import Axis, AxisConfig, open_axis
+from processing.track.revolution.axis import Axis, AxisConfig, open_axes
 from processing.track.revolution.azimuth import (
     AzimuthConfig,
     Azimuths,
@@ -78,8 +78,7 @@ def cylinder(rng: np.random.Generator, middle_m: np.ndarray) -> tuple[np.ndarray
 def test_a_cylinders_axis_is_found_though_it_has_a_handle() -> None:
     middle = np.array([0.02, 0.0, -0.03])
     scene, poses = seen(*cylinder(np.random.default_rng(1), middle))
-    axis = open_axis(scene, poses, np.ones(len(poses), dtype=bool), AxisConfig())
-    assert axis is not None
+    axis = open_axes(scene, poses, np.ones(len(poses), dtype=bool), AxisConfig())[0]
     assert abs(axis.direction[1]) == pytest.approx(1, abs=1e-3)
     np.testing.assert_allclose(axis.point_m[[0, 2]], middle[[0, 2]], atol=1e-3)
     there = axis.rotation(0.7)
@@ -96,7 +95,7 @@ def test_a_box_has_no_open_axis() -> None:
             points.append(face)
             normals.append(np.tile(sign * np.eye(3)[a], (600, 1)))
     scene, poses = seen(np.concatenate(points), np.concatenate(normals))
-    assert open_axis(scene, poses, np.ones(len(poses), dtype=bool), AxisConfig()) is None
+    assert open_axes(scene, poses, np.ones(len(poses), dtype=bool), AxisConfig()) == []
 
 
 def pace(views: int, flies: bool = False) -> Pace:

@@ -17,7 +17,7 @@ from processing.track.joint_refinement import Motion, Refined
 from processing.track.revolution import profile_kernels as rk
 from processing.track.revolution.axis import Axis
 from processing.track.revolution.azimuth import AzimuthConfig, given_azimuths
-from processing.track.revolution.profile import BodyConfig, RoundBody, anchored, is_round
+from processing.track.revolution.profile import BodyConfig, RoundBody, anchored, is_round, laid_on_profile
 from recordings.geometry import CameraModel, rotation_exp
 
 CAMERA = CameraModel("d455", 640, 480, np.array([[386.0, 0, 320], [0, 386, 240], [0, 0, 1]]))
@@ -134,6 +134,20 @@ def test_outlines_say_whether_a_body_is_round_about_an_axis(cans: tuple[ViewStor
     every = np.ones(len(truth), dtype=bool)
     assert is_round(store, truth, every, AXIS, BodyConfig())
     assert not is_round(store, truth, every, Axis(np.array([1.0, 0.0, 0.0]), np.zeros(3)), BodyConfig())
+
+
+@pytest.mark.parametrize("way", [[1.0, 0.0], [0.6, -0.8]])
+def test_an_axis_that_normals_left_open_is_where_one_profile_fits_all_views(
+    cans: tuple[ViewStore, np.ndarray], way: list[float]
+) -> None:
+    store, truth = cans
+    off = np.eye(4)
+    off[:3, :3] = rotation_exp(np.radians(15) * np.array([*way, 0.0]))
+    off[:3, 3] = 0.003 * np.array([-way[1], way[0], 0.0])
+    axis, share = laid_on_profile(store, truth, np.ones(len(truth), dtype=bool), AXIS.seen_from(off), BodyConfig())
+    assert abs(axis.direction @ AXIS.direction) > np.cos(np.radians(0.5))
+    assert np.linalg.norm(axis.point_m[:2]) < 5e-4
+    assert share > 0.9
 
 
 def test_given_azimuths_of_a_can_that_nothing_marks_stay_and_grow_uncertain() -> None:
