@@ -51,7 +51,7 @@ def center_of_mass(
     A, b = np.array(rows), np.array(values)
     for _ in range(20):
         left = np.linalg.norm(b - A @ center, axis=1)
-        weight = 1 / (1 + (left / (2.5 * config.fall_m_s2)) ** 2) ** 2 / config.fall_m_s2**2
+        weight = geman_mcclure_weight((left / (2.5 * config.fall_m_s2)) ** 2) / config.fall_m_s2**2
         near = 1 / config.center_sigma_m**2
         information = np.einsum("n,nij,nik->jk", weight, A, A) + near * np.eye(3)
         center = np.linalg.solve(information, np.einsum("n,nij,ni->j", weight, A, b) + near * tags_center)

@@ -19,14 +19,14 @@ from processing.store import Done
 from processing.track.beam import Scene, seconds
 from processing.track.flags import fit_of_sure, reflagged
 from processing.track.free_surface.adjust import AdjustedToss, PosedToss, adjusted
-from processing.track.hypotheses import HypothesisConfig, open_azimuths
+from processing.track.hypotheses import HypothesisConfig, open_azimuths, with_azimuths_sought
 from processing.track.known_shape import center_of
 from processing.track.track_toss import views_of
 from recordings.geometry import rotation_angle_rad
 from recordings.progress import Silent
 from recordings.results.folder import read_shape, read_track, write_track
 
-VERSION = 15
+VERSION = 16
 
 AS_WELL = 1.2
 """An unsure frame fits as well as sure ones where it costs no more than so many times what the worst of them does
@@ -62,7 +62,9 @@ def adjust(
                 colorless=seen.colorless,
             )  # fmt: skip
             scene = Scene(store, seconds(times_ns), gravity, center_of(body), Sift(), hand=seen.hand)
-            return PosedToss(scene, before[toss].camera_from_object)
+            poses = before[toss].camera_from_object
+            use = np.isfinite(poses[:, 0, 0]) & np.array([store.usable(i) for i in range(len(poses))])
+            return PosedToss(scene, *with_azimuths_sought(scene, poses, use, run.config.track.hypotheses))
 
         tosses = list(side_by_side(opened, list(tracks)))
         config = run.config.track

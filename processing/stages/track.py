@@ -22,7 +22,7 @@ from recordings.results.folder import read_shape, read_track, write_track
 from recordings.results.track_notes import write_notes
 from recordings.tracks import ObjectTrack
 
-VERSION = 30
+VERSION = 31
 
 
 @dataclass(frozen=True)

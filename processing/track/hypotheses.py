@@ -29,7 +29,7 @@ from processing.track.joint_refinement import (
     steady_motion,
 )
 from processing.track.pairs import KnownFigures
-from processing.track.revolution.axis import Axis, open_axes
+from processing.track.revolution.axis import Axis, angles_between, open_axes
 from processing.track.revolution.azimuth import (
     AzimuthConfig,
     Azimuths,
@@ -152,6 +152,22 @@ def open_azimuths(
         return None
     given = given_azimuths(scene, poses, use, axis, config.azimuth)
     return with_uncertainty(given, inconsistency(scene, poses, use, given, config.azimuth), first, config.azimuth)
+
+
+def with_azimuths_sought(
+    scene: Scene, poses: Float[Array, "n 4 4"], use: Bool[Array, " n"], config: HypothesisConfig
+) -> tuple[Float[Array, "n 4 4"], Axis | None]:
+    """The poses of views of a body that looks round with the azimuths that fit all of them together (most views stay),
+    and its axis. As they are, and None, where it does not look round."""
+    axis = _round_axis(scene, poses, use, config) if use.any() else None
+    if axis is None:
+        return poses, None
+    found = estimate_azimuths(scene, poses, [], use, int(use.argmax()), axis, config.azimuth)
+    turn = angles_between(found.poses[use], poses[use], axis)
+    most = turn[np.abs(np.sin(0.5 * (turn[:, None] - turn))).sum(1).argmin()]
+    out = poses.copy()
+    out[use] = found.poses[use] @ axis.rotation(float(most))
+    return out, axis
 
 
 def _round_axis(

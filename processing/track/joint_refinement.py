@@ -25,7 +25,7 @@ from processing.track.depth_error.fields import DepthErrors
 from processing.track.keyframes import view_directions
 from processing.track.pairs import compared
 from processing.track.schedule import Schedule, rows
-from recordings.estimation.robust import geman_mcclure_weight
+from recordings.estimation.robust import cauchy_weight, geman_mcclure_weight
 from recordings.geometry import rotation_log, skew
 
 
@@ -172,8 +172,9 @@ def refine(
     priors: Sequence[Terms] = (),
 ) -> Refined:
     """All poses in `use` at once; those in `fixed` stay. `poses` of other views are returned as they are. No pose moves
-    along the twist `held`, where there is one. Views with the same number in `tied` move as one (not at all with a
-    fixed one); those with -1 move alone. `priors`: what else is known of the poses."""
+    along the twist `held`, where there is one, but for all of them together where others are fixed. Views with the
+    same number in `tied` move as one (not at all with a fixed one); those with -1 move alone. `priors`: what else is
+    known of the poses."""
     poses = poses.copy()
     free = use & ~fixed
     place = np.where(free, np.cumsum(free) - 1, -1)
@@ -190,7 +191,7 @@ def refine(
         for _ in range(int(row[k.STEPS])):
             H, g, figures = _normal_equations(store, poses, use, pairs, place, row, motion, config, priors, errors)
             if held is not None:
-                _hold(H, held)
+                _hold(H, held, together=bool((use & fixed).any()))
             step = -np.linalg.solve(H + np.diag(1e-6 * np.diag(H) + 1e-9), g).reshape(-1, 6)
             taken = step / np.maximum(np.linalg.norm(step.reshape(-1, 2, 3), axis=2) / (0.03, 0.2), 1.0).max(1)[:, None]
             for i in np.flatnonzero(place >= 0):
@@ -211,11 +212,12 @@ def _tied(place: Int[Array, " n"], tied: Int[Array, " n"]) -> Int[Array, " n"]:
     return np.where(out >= 0, np.searchsorted(left, out), -1)
 
 
-def _hold(H: Float[Array, "f f"], held: Float[Array, "6"]) -> None:
-    """Takes one twist of the object frame out of every view's freedom."""
+def _hold(H: Float[Array, "f f"], held: Float[Array, "6"], together: bool) -> None:
+    """Takes one twist of the object frame out of every view's freedom, or but for one by which all move `together`."""
+    views = len(H) // 6
+    each = np.eye(views) - (1.0 / max(views, 1) if together else 0.0)
     stiff = 1e3 * np.trace(H) / max(len(H), 1) * np.outer(held, held) / float(held @ held)
-    for a in range(0, len(H), 6):
-        H[a : a + 6, a : a + 6] += stiff
+    H += np.kron(each, stiff)
 
 
 def _normal_equations(
@@ -227,7 +229,7 @@ def _normal_equations(
     H, g = np.zeros((count, count, 6, 6)), np.zeros((count, 6))
     if errors is None:
         blocks, gradients, figures = compared(store, poses, pairs, row, shaded=not config.round_body)
-        weight = 1.0 / (1.0 + (figures[:, 0] / config.sure_cost) ** 2) / config.shared_noise
+        weight = cauchy_weight((figures[:, 0] / config.sure_cost) ** 2) / config.shared_noise
         add_pairs(H, g, blocks * weight[:, None, None], gradients * weight[:, None], place[pairs])
     else:
         figures = errors.add(H, g, poses, pairs, place, row)

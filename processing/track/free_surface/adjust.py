@@ -24,6 +24,7 @@ from processing.track.free_surface.terms import SurfaceMeasurements, SurfaceTerm
 from processing.track.hypotheses import HypothesisConfig, motion_of
 from processing.track.joint_refinement import Motion, choose_pairs, refine
 from processing.track.pairs import compared
+from processing.track.revolution.axis import Axis
 from processing.track.schedule import rows
 from recordings.progress import Progress
 from recordings.tracks import ObjectShape
@@ -34,10 +35,12 @@ APPEARANCE_SCALES = (0.16, 0.08, 0.04)
 
 @dataclass(frozen=True, eq=False)
 class PosedToss:
-    """One toss's views, and its poses (camera_from_object, 4x4; NaN where unknown) in the frame of the shape."""
+    """One toss's views, its poses (camera_from_object, 4x4; NaN where unknown) in the frame of the shape, and a round
+    body's axis: its azimuths, which pairs of views would spoil, stay."""
 
     scene: Scene
     poses: Float[Array, "n 4 4"]
+    axis: Axis | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +113,9 @@ def _refined(
     pairs = pairs[~fixed[pairs].all(axis=1) & np.isfinite(drawn.at[pairs]).all(axis=(1, 2, 3))]
     colors = AppearanceTerms(drawn, pairs, scale)
     graph = replace(config.graph, schedule=config.finest, neighbours=0, loops=0)
-    joint = refine(drawn.store, poses, use, fixed, motion, graph, priors=(terms, colors))
+    axis = tosses[t].axis
+    held = None if axis is None else axis.twist
+    joint = refine(drawn.store, poses, use, fixed, motion, graph, held, priors=(terms, colors))
     poses, spread = joint.poses[views], np.full((len(used[t]), 6, 6), np.nan)
     spread[used[t]] = joint.covariance[views][used[t]]
     own = pairs[~fixed[pairs].any(axis=1)] - views.start

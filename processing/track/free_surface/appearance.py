@@ -13,6 +13,7 @@ from processing.track.free_surface import kernels
 from processing.track.free_surface.drawn import DrawnViews
 from processing.track.kernels import SHADING
 from processing.track.pairs import PART, eliminated
+from recordings.estimation.robust import cauchy_weight
 
 REACH_M = 0.01
 """A point farther than this from the surface that the other view shows is hidden from it."""
@@ -52,7 +53,7 @@ class AppearanceTerms:
 
         in_parts(compare, n, PART)
         blocks, gradients = eliminated(blocks, gradients, crossed, among)
-        weight = 1.0 / (1.0 + (cost / SURE_COST) ** 2) / ADJUST_PAIRS_PER_MEASUREMENT
+        weight = cauchy_weight((cost / SURE_COST) ** 2) / ADJUST_PAIRS_PER_MEASUREMENT
         blocks, gradients = blocks * weight[:, None, None], gradients * weight[:, None]
         ends = place[self._pairs[:, 0]], place[self._pairs[:, 1]]
         for a, one in enumerate(ends):

@@ -26,7 +26,7 @@ from processing.track.beam import Scene
 from processing.track.revolution import azimuth_kernels as tk
 from processing.track.revolution.axis import Axis, AxisConfig, angles_between
 from processing.track.revolution.azimuth_smoothing import Normal, SteadyConfig, pace_of, steadied
-from processing.track.revolution.print_match import print_costs
+from processing.track.revolution.print_match import PrintMatch, print_match
 from processing.track.revolution.rolling import Grounded, grounded, sunk
 from processing.track.revolution.unwrapping import Unwrapped, UnwrappingConfig, unwrap
 
@@ -65,12 +65,13 @@ class AzimuthConfig:
     """A pair costs no more than this by shape (nats)."""
     usual_left: float = 0.1
     """What stands off the body contradicts itself in so large a share of what random azimuths cost even at the right
-    ones: mugs of four kinds leave .02 to .09; a bottle on whose table the depth ran on left .55 and .79."""
+    ones: mugs of four kinds leave .02 to .09; a bottle on whose table the depth ran on left .55 and .79 ..."""
+    usual_print: float = 0.07
+    """... and print in so large a one: cans .003 to .05, glossy bottles whose azimuths are off by 10 to 60 degrees .1
+    to .2."""
     misfit: float = 3.0
-    """Where more is left than right azimuths leave, views err together (lamps mirrored, a shape that is none), and what
-    they tell counts by this power of how often that is. With 1 and 2, four tosses of glossy bodies are 11 and 4
-    standard deviations off in the mean of their squares, with 3 one to two; printed cans leave 1.3 to 4 times what is
-    expected, at the true azimuths as at those found, glossy bodies with few marks 4 to 26."""
+    """Where more is left than that, views err together (lamps mirrored, a shape that is none), and what they tell
+    counts by this power of how often that is (docs/decisions)."""
     standing_share: float = 0.7
     """What stands off the body shows in most pairs: where random azimuths cost less than this share of `most_shape`, it
     is seen in few views (a finger, depth that runs on to the table) and counts the less, by the third power."""
@@ -92,10 +93,11 @@ class AzimuthConfig:
 
 @dataclass(frozen=True)
 class Trust:
-    """Weights, 0..1, of appearance and of what stands off the body."""
+    """Weights, 0..1, of appearance and of what stands off the body; how views' appearance correlates where it meets."""
 
     appearance: float = 1.0
     shape: float = 1.0
+    correlations: tuple[float, ...] = (0.0, 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,25 +148,32 @@ def estimate_azimuths(
     scene: Scene, poses: Float[Array, "n 4 4"], rivals: list[Float[Array, "n 4 4"]], use: Bool[Array, " n"], first: int,
     axis: Axis, config: AzimuthConfig,
 ) -> Azimuths:  # fmt: skip
-    """The poses with azimuths that fit all frames together, sought from them and from `rivals`; the first stays."""
+    """The poses with azimuths that fit all frames together, sought from them and from `rivals`; the first stays. As
+    they are where others fit no better than by chance: half a nat for each azimuth."""
     frames = _frames(scene, use, config)
     if len(frames.pairs) == 0:
         return Azimuths(poses, np.zeros(len(poses)), axis)
     poses = _stood(poses, frames, axis, first)
     step = 2 * np.pi / config.cells
-    appearance, shape, standing, rest = _weighed(scene, poses, frames, axis, config)
+    seen, shape, standing, rest = _weighed(scene, poses, frames, axis, config)
     starts = [np.zeros(len(frames.views), dtype=np.int64)]
     apart = [angles_between(poses[frames.views], r[frames.views], axis) for r in rivals]
     starts += [np.round(a / step).astype(np.int64) % config.cells for a in apart]
-    nothing = np.zeros_like(shape)
-    alone = [_sought(_near(costs, nothing), rest, starts, config) for costs in (appearance, shape)]
-    trust = _trust((appearance, alone[0]), (shape, alone[1]), frames, config)
-    costs = _near(trust.appearance * appearance, trust.shape * shape)
-    state = _sought(costs, rest, [*starts, *alone], config)
+    nothing, correlations = np.zeros_like(shape), seen.best_correlations()
+    by_shape, by_print = _sought(_near(nothing, shape), rest, starts, config), starts[0]
+    for _ in range(2):  # how much print there is, the azimuths tell that it meets best at
+        appearance = seen.costs(correlations)
+        by_print = _sought(_near(appearance, nothing), rest, [*starts, by_print], config)
+        correlations = seen.best_correlations(_between(by_print, frames, config))
+    trust = _trust(seen, by_print, (shape, by_shape), frames, config)
+    costs = _told(seen, shape, trust)
+    state = _sought(costs, rest, [*starts, by_print, by_shape], config)
+    better = tk.energy(starts[0], costs, *rest) - tk.energy(state, costs, *rest) > 0.5 * len(state)
+    state = state if better else starts[0]
     out = _moved(poses, frames, state * step, axis, first)
     spread = _azimuth_sigma_rad(frames, costs, rest, state, len(poses))
-    trust = replace(trust, shape=standing * trust.shape)
-    return steady(scene, Azimuths(out, spread, axis, trust), use, first, config)
+    found = Azimuths(out, spread, axis, replace(trust, shape=standing * trust.shape))
+    return steady(scene, found, use, first, config) if better else found
 
 
 def given_azimuths(
@@ -174,23 +183,22 @@ def given_azimuths(
     frames = _frames(scene, use, config)
     if len(frames.pairs) == 0:
         return Azimuths(poses, np.zeros(len(poses)), axis)
-    appearance, shape, standing, rest = _weighed(scene, poses, frames, axis, config)
+    seen, shape, standing, rest = _weighed(scene, poses, frames, axis, config)
     state = np.zeros(len(frames.views), dtype=np.int64)
-    trust = _trust((appearance, state), (shape, state), frames, config)
-    costs = _near(trust.appearance * appearance, trust.shape * shape)
-    spread = _azimuth_sigma_rad(frames, costs, rest, state, len(poses))
+    trust = _trust(seen, state, (shape, state), frames, config)
+    spread = _azimuth_sigma_rad(frames, _told(seen, shape, trust), rest, state, len(poses))
     return Azimuths(poses, spread, axis, replace(trust, shape=standing * trust.shape))
 
 
 def _weighed(
     scene: Scene, poses: Float[Array, "n 4 4"], frames: _Frames, axis: Axis, config: AzimuthConfig
-) -> tuple[Float[Array, "m c"], Float[Array, "m c"], float, tuple[object, ...]]:
-    """Cost of each pair for all azimuths between its views, by appearance and by shape, the weight of the latter (which
-    is in it), and what the search needs."""
+) -> tuple[PrintMatch, Float[Array, "m c"], float, tuple[object, ...]]:
+    """How each pair's print meets at all azimuths between its views, what these cost by shape, the weight of the latter
+    (which is in it), and what the search needs."""
     unwrapped = unwrap(scene, poses, frames.views, axis, config.cells, config.unwrapping)
     body = grounded(scene.store, frames.views, poses[frames.views], axis, unwrapped.rings)
     pace = pace_of(scene, poses, frames.runs, frames.views, body, config.steady)
-    appearance = print_costs(unwrapped, frames.pairs)
+    seen = print_match(unwrapped, frames.pairs)
     # from azimuths of -cells/2..cells/2 to azimuths of 0..cells-1
     shape = -np.roll(
         _shape_ratios(unwrapped, frames.pairs, config.cells // 2, config)[:, :-1], -(config.cells // 2), axis=1
@@ -203,7 +211,7 @@ def _weighed(
     motion = np.array([config.steady.fast_rad_s, config.fast_cost])
     expected = pace.expected.step_rad, pace.expected.sigma_rad
     rest = (frames.pairs, pace.base_rad, pace.steps_s, pace.still, pace.spin_weight, usual, *expected, step, motion)
-    return appearance, shape, standing, rest
+    return seen, shape, standing, rest
 
 
 def _sunk(
@@ -223,13 +231,25 @@ def _azimuth_sigma_rad(
 
 
 def _trust(
-    by_appearance: tuple[Float[Array, "m c"], Int[Array, " v"]], by_shape: tuple[Float[Array, "m c"], Int[Array, " v"]],
+    seen: PrintMatch, by_print: Int[Array, " v"], by_shape: tuple[Float[Array, "m c"], Int[Array, " v"]],
     frames: _Frames, config: AzimuthConfig,
 ) -> Trust:  # fmt: skip
-    """What appearance and shape weigh: costs of the pairs by each, and the azimuths that fit it best."""
-    usual = _expected(frames), config.usual_left * float(by_shape[0].mean())
-    left = (_left(costs, frames.pairs, state) for costs, state in (by_appearance, by_shape))
-    return Trust(*(min(u / max(x, 1e-9), 1.0) ** config.misfit for u, x in zip(usual, left)))
+    """What appearance and shape weigh, by the azimuths that fit each best."""
+    correlations = seen.best_correlations(_between(by_print, frames, config))
+    told = (seen.costs(correlations), by_print, config.usual_print), (*by_shape, config.usual_left)
+    left = [max(_left(costs, frames.pairs, state), 1e-9) for costs, state, _ in told]
+    usual = [min(u * float(costs.mean()) / x, 1.0) ** config.misfit for (costs, _, u), x in zip(told, left)]
+    return Trust(min(_expected(frames) / left[0], 1.0) * usual[0], usual[1], tuple(correlations.tolist()))
+
+
+def _told(seen: PrintMatch, shape: Float[Array, "m c"], trust: Trust) -> Float[Array, "m c"]:
+    """What pairs cost as far as either is trusted."""
+    return _near(trust.appearance * seen.costs(np.array(trust.correlations)), trust.shape * shape)
+
+
+def _between(state: Int[Array, " v"], frames: _Frames, config: AzimuthConfig) -> Int[Array, " m"]:
+    """Cells between the views of each pair."""
+    return np.asarray((state[frames.pairs[:, 0]] - state[frames.pairs[:, 1]]) % config.cells)
 
 
 def _left(costs: Float[Array, "m c"], pairs: Int[Array, "m 2"], state: Int[Array, " v"]) -> float:
@@ -239,7 +259,7 @@ def _left(costs: Float[Array, "m c"], pairs: Int[Array, "m 2"], state: Int[Array
 
 
 def _expected(frames: _Frames) -> float:
-    """Mean cost (nats) of a pair at the right azimuths, as `print_costs` counts it: half of its degrees of freedom."""
+    """Mean cost (nats) of a pair at the right azimuths, as `PrintMatch` counts it: half of its degrees of freedom."""
     m, v = len(frames.pairs), len(frames.views)
     return 0.5 * max(m - v + 1, 1) / m * v / m
 
@@ -333,7 +353,8 @@ def _fine_costs(
     """Cost of each pair for azimuths near those of the poses, in fine cells, and a cell's angle."""
     share = config.cells / config.fine_cells  # more cells, as many pixels
     reach = np.arange(-config.fine_reach, config.fine_reach + 1)
-    appearance = _above_least(print_costs(unwrapped, frames.pairs)[:, reach])
+    seen = print_match(unwrapped, frames.pairs)
+    appearance = share * _above_least(seen.costs(np.array(trust.correlations))[:, reach])
     shape = _above_least(-share * _shape_ratios(unwrapped, frames.pairs, config.fine_reach, config))
     shape = minimum_filter1d(np.minimum(shape, config.most_shape), 2 * config.slack + 1, axis=1, mode="nearest")
     cell_rad = 2 * np.pi / config.fine_cells

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 from numpy import ndarray as Array
@@ -43,11 +42,6 @@ class UnwrappingConfig:
     """Of the pixels, one in so many is used to fit the light."""
     robust: float = 1.5
     """Residuals of the light beyond so many standard deviations belong to the object."""
-    normals: int = 24
-    """Bins across the normals that face the camera (8 degrees)."""
-    slow_deg: float = 30.0
-    slow_rows: int = 5
-    """A change of appearance over more than so many degrees and rows is the light's."""
     shine: float = 0.2
     """A surface whose brightness is beyond the light's by this share, and its colour paler, mirrors a lamp ..."""
     grey: float = 1.2
@@ -62,7 +56,6 @@ class UnwrappingConfig:
 @dataclass(frozen=True, eq=False)
 class Unwrapped:
     """`appearance` (v, r, c, 2): two differences of colour without the light, mean per cell; `count` (v, r, c): pixels.
-    `lit`, `lit_count`: the same by the surface's normal in camera axes.
     `odd` (v, q, c): share of cells where something stands off the body, `sides` (v, 3, q, c) the same by the side that
     was seen; `free` (v, q, c): 1 where nothing stands. Rows r: outside by height, both ends by radius; q: layers times
     heights; c: angles about the axis. `standing`: per view the pixels of what stands off the body, as samples. `rings`:
@@ -70,8 +63,6 @@ class Unwrapped:
 
     appearance: Float[Array, "v r c 2"]
     count: Float[Array, "v r c"]
-    lit: Float[Array, "v b 2"]
-    lit_count: Float[Array, "v b"]
     odd: Float[Array, "v q c"]
     sides: Float[Array, "v 3 q c"]
     free: Float[Array, "v q c"]
@@ -116,7 +107,6 @@ def unwrap(
     mean, count = np.zeros((len(views), rows, cells, 2)), np.zeros((len(views), rows, cells))
     odd = np.zeros((len(views), 3, layers * heights, cells))
     free = np.zeros((len(views), layers * heights, cells))
-    lit, lit_count = np.zeros((len(views), config.normals**2, 2)), np.zeros((len(views), config.normals**2))
     standing = []
     for n, (i, p) in enumerate(zip(views, seen)):
         cell = np.floor((p.angle + np.pi) / (2 * np.pi) * cells).astype(int) % cells
@@ -125,41 +115,16 @@ def unwrap(
         use = (row >= 0) & ~shines
         np.add.at(count[n], (row[use], cell[use]), 1)
         np.add.at(mean[n], (row[use], cell[use]), left[use])
-        bins = _normal_bins(p.normal_camera[use], config.normals)
-        np.add.at(lit_count[n], bins, 1)
-        np.add.at(lit[n], bins, left[use] - left[use].mean(0) if use.any() else left[use])
         window_m = float(config.window_px * scene.store.center_m[i][2] / scene.store.rectified.focal[0])
         height, layer, side, off = _off(p, profile, low, window_m, config)
         np.add.at(odd[n], (side[off], layer[off] * heights + height[off], cell[off]), 1)
         free[n] = _free(scene, int(i), poses[i], axis, profile, low, cells, config)
         standing.append(p.samples[off])
     mean /= np.maximum(count, 1)[..., None]
-    lit /= np.maximum(lit_count, 1)[..., None]
-    mean = np.array([_without_slow_changes(m, c, config) for m, c in zip(mean, count)])
     anyhow = np.minimum(odd.sum(1), 3) / 3
     rings = np.column_stack([np.clip(low + (np.arange(heights) + 0.5) * config.row_m, low, high), profile])
     rings = np.concatenate([[[low, profile[0]]], rings, [[high, profile[-1]]]])
-    return Unwrapped(mean, count, lit, lit_count, anyhow, np.minimum(odd, 3) / 3, free * (anyhow == 0), standing, rings)
-
-
-def _normal_bins(normal: Float[Array, "p 3"], bins: int) -> Int[Array, " p"]:
-    """The normals towards the camera in a square of bins of equal area (Lambert's projection)."""
-    scale = np.sqrt(1 / np.maximum(1 - normal[:, 2], 1e-6))
-    at = np.clip(((scale[:, None] * normal[:, :2] + 1) / 2 * bins).astype(int), 0, bins - 1)
-    return np.asarray(at[:, 1] * bins + at[:, 0])
-
-
-def _without_slow_changes(
-    mean: Float[Array, "r c 2"], count: Float[Array, "r c"], config: UnwrappingConfig
-) -> Float[Array, "r c 2"]:
-    """Appearance less its mean nearby: reflections of the table and shadows change slowly over a surface, what is
-    printed on it does not."""
-    wide = round(config.slow_deg / 360 * count.shape[1])
-    seen = (count > 0).astype(np.float64)[..., None]
-    padded = np.pad(np.concatenate([mean * seen, seen], -1), ((0, 0), (wide, wide), (0, 0)), "wrap")
-    window = 2 * wide + 1, config.slow_rows
-    around = cv2.boxFilter(padded, -1, window, normalize=False, borderType=cv2.BORDER_CONSTANT)[:, wide:-wide]
-    return np.where(seen > 0, mean - around[..., :2] / np.maximum(around[..., 2:], 1.0), 0.0)
+    return Unwrapped(mean, count, anyhow, np.minimum(odd, 3) / 3, free * (anyhow == 0), standing, rings)
 
 
 def across(axis: Axis) -> tuple[Float[Array, "3"], Float[Array, "3"]]:

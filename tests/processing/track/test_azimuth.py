@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import multivariate_normal, norm
 
 from processing.features.sift import Sift
 from processing.sensor import view_layout as lay
@@ -25,7 +26,7 @@ from processing.track.revolution.azimuth import (
     with_uncertainty,
 )
 from processing.track.revolution.azimuth_smoothing import Pace, SteadyConfig, steadied
-from processing.track.revolution.print_match import print_costs
+from processing.track.revolution.print_match import PrintMatch, print_match
 from processing.track.revolution.rolling import ExpectedSteps
 from processing.track.revolution.unwrapping import (
     Unwrapped,
@@ -34,7 +35,6 @@ from processing.track.revolution.unwrapping import (
     _off,
     _Pixels,
     _shines,
-    _without_slow_changes,
 )
 from recordings.geometry import CameraModel, rotation_exp
 
@@ -169,43 +169,56 @@ def test_a_stretch_that_shows_nothing_turns_as_the_body_rolls() -> None:
     assert sigma[-1] < 0.2 * blind_sigma[-1]
 
 
-def unwrapped(appearance: np.ndarray, count: np.ndarray, lit: np.ndarray | None = None) -> Unwrapped:
+def unwrapped(appearance: np.ndarray, count: np.ndarray) -> Unwrapped:
     views, _, cells = count.shape
-    lit = np.zeros((views, 1, 2)) if lit is None else lit
-    lit_count = np.broadcast_to(2.0 * (np.abs(lit).sum((0, 2)) > 0), lit.shape[:2])
     empty = np.zeros((views, 1, cells))
-    return Unwrapped(
-        appearance, count, lit, lit_count, empty, np.zeros((views, 3, 1, cells)), empty, [], np.zeros((0, 2))
-    )
+    return Unwrapped(appearance, count, empty, np.zeros((views, 3, 1, cells)), empty, [], np.zeros((0, 2)))
 
 
-def test_appearance_of_one_colour_leaves_the_azimuth_open_and_a_label_fixes_it() -> None:
-    rng = np.random.default_rng(0)
-    appearance, count = rng.normal(0, 0.02, (2, 4, 60, 2)), np.full((2, 4, 60), 4.0)
-    count[:, :, 40:] = 0
-    pairs = np.array([[0, 1]])
-    assert print_costs(unwrapped(appearance, count), pairs).max() < 12
-    appearance[0, 1:3, 20:26] += 0.6
-    appearance[1, 1:3, 12:18] += 0.6
-    costs = print_costs(unwrapped(appearance, count), pairs)[0]
-    assert int(costs.argmin()) == 8
-    assert costs[0] > 20
-    assert costs[8] == 0
+def seen_half(around: np.ndarray, turns: np.ndarray, noise: float) -> tuple[np.ndarray, np.ndarray]:
+    """Maps and counts of views that see 150 degrees each of a body turned so, and err by `noise`."""
+    rng = np.random.default_rng(2)
+    maps = np.array([np.roll(around, -t, axis=1) for t in turns]) + rng.normal(0, noise, (len(turns), *around.shape))
+    count = np.zeros(maps.shape[:3])
+    count[:, :, :50] = 2.0
+    return maps * (count[..., None] > 0), count
 
 
-def test_print_all_over_tells_the_azimuth_to_a_cell_and_what_stays_with_the_room_tells_none() -> None:
+def test_a_body_of_one_colour_leaves_the_azimuth_open_and_a_wide_label_fixes_it() -> None:
+    turns = np.random.default_rng(0).integers(0, 120, 10)
+    pairs = np.array([(a, b) for a in range(10) for b in range(a)])
+    frames, config = _Frames([[n] for n in range(10)], np.arange(10), pairs), AzimuthConfig()
+    around, told = np.zeros((8, 120, 2)), []
+    for label in (0.0, 0.6):
+        around[2:6, 20:90, 0] = label  # over more than a view shows: its two edges tell
+        seen = print_match(unwrapped(*seen_half(around, turns, 0.1)), pairs)
+        trust = _trust(seen, -turns % 120, (np.zeros((len(pairs), 120)), turns), frames, config)
+        costs = seen.costs(np.array(trust.correlations))
+        told.append(trust.appearance * float(costs.mean()))
+    assert told[0] == 0.0  # no correlation is likelier than any
+    assert told[1] > 0.3
+    at = np.arange(len(pairs)), (turns[pairs[:, 1]] - turns[pairs[:, 0]]) % 120
+    assert costs[at].mean() < 0.15 * costs.mean()
+
+
+def test_print_all_over_tells_the_azimuth_to_a_cell() -> None:
     rng = np.random.default_rng(1)
-    around = rng.normal(0, 1, (6, 120, 2))
-    turns, count = np.array([0, 11, 47]), np.full((3, 6, 120), 2.0)
-    appearance = np.array([np.roll(around, -t, axis=1) for t in turns]) + rng.normal(0, 0.5, (3, 6, 120, 2))
+    turns = np.array([0, 11, 47])
     pairs = np.array([[1, 0], [2, 0], [2, 1]])
-    found = print_costs(unwrapped(appearance, count), pairs).argmin(1)
-    np.testing.assert_array_equal(found, (turns[pairs[:, 1]] - turns[pairs[:, 0]]) % 120)
-    # a lamp's mirror image: alike by normals as much as by places
-    light = np.repeat(around[None], 3, axis=0) + rng.normal(0, 0.5, (3, 6, 120, 2))
-    blind = print_costs(unwrapped(light, count, light.reshape(3, -1, 2)), pairs)
-    assert blind.max() < 1.0
-    assert print_costs(unwrapped(light, count), pairs).max() > 100
+    around = rng.normal(0, 1, (6, 120, 2)) + 5.0 * np.arange(6)[:, None, None]  # rows differ, which tells nothing
+    appearance = np.array([np.roll(around, -t, axis=1) for t in turns]) + rng.normal(0, 0.5, (3, 6, 120, 2))
+    seen = print_match(unwrapped(appearance, np.full((3, 6, 120), 2.0)), pairs)
+    at = (turns[pairs[:, 1]] - turns[pairs[:, 0]]) % 120
+    np.testing.assert_array_equal(seen.costs(seen.best_correlations()).argmin(1), at)
+    np.testing.assert_allclose(seen.best_correlations(at), 1 / (1 + 0.5**2))
+
+
+def test_the_log_ratio_is_that_of_correlated_to_independent_samples() -> None:
+    r, a, b = 0.7, np.array([0.4, -1.2, 2.0]), np.array([0.1, -0.8, -0.3])
+    seen = PrintMatch(*np.array([[[[a @ b]]] * 2, [[[a @ a + b @ b]]] * 2]), np.array([[3.0]]), 1.0)
+    both = multivariate_normal(cov=[[1, r], [r, 1]]).logpdf(np.column_stack([a, b])).sum()
+    alone = norm.logpdf(np.concatenate([a, b])).sum()
+    assert seen._log_ratio(1, r)[0, 0] == pytest.approx(both - alone)
 
 
 def test_inconsistency_of_the_poses_widens_the_uncertainty() -> None:
@@ -252,19 +265,6 @@ def test_the_table_seen_through_a_handle_stands_not_off_the_body() -> None:
     assert not off.any()
 
 
-def test_what_changes_slowly_round_the_body_is_light_and_what_is_printed_stays() -> None:
-    cells, rows = 120, 12
-    angle = np.arange(cells) / cells * 2 * np.pi
-    count = np.zeros((rows, cells))
-    count[:, 20:90] = 2.0
-    mean = np.tile(0.3 * np.cos(angle)[None, :, None], (rows, 1, 2))
-    mean[4:8, 50:55, 0] += 0.4  # a label 15 degrees wide
-    left = _without_slow_changes(mean, count, UnwrappingConfig())
-    assert (left[count == 0] == 0).all()
-    assert np.abs(left[:, 35:75, 1]).max() < 0.03
-    assert left[5:7, 51:54, 0].min() > 0.25
-
-
 def test_frames_between_which_the_body_stands_still_turn_together() -> None:
     rng = np.random.default_rng(3)
     axis = Axis(np.array([0.0, 1.0, 0.0]), np.array([0.01, 0.0, 0.02]))
@@ -285,15 +285,14 @@ def test_what_contradicts_itself_tells_little() -> None:
     cells = config.cells
     pairs = np.array([(a, b) for a in range(views) for b in range(a)])
     frames = _Frames([[n] for n in range(views)], np.arange(views), pairs)
+    no_print = PrintMatch(*np.zeros((2, 2, len(pairs), cells)), np.zeros((len(pairs), cells)), 1.0)
     noise = rng.uniform(0.0, 2.0, (len(pairs), cells))
     state = rng.integers(0, cells, views)
-    assert max(vars(_trust((noise, state), (noise, state), frames, config)).values()) < 0.01
+    assert _trust(no_print, state, (noise, state), frames, config).shape < 0.01
     label = np.full((len(pairs), cells), 2.0)
     at = (state[pairs[:, 0]] - state[pairs[:, 1]])[:, None] + np.arange(-2, 3)
     np.put_along_axis(label, at % cells, 0.0, axis=1)
-    told = label + 0.05 * noise
-    assert _trust((told, state), (noise, state), frames, config).appearance == 1.0
-    assert _trust((noise, state), (told, state), frames, config).shape == 1.0
+    assert _trust(no_print, state, (label + 0.05 * noise, state), frames, config).shape == 1.0
 
 
 def test_a_spin_may_change_at_a_release_and_hardly_in_flight() -> None:

@@ -12,10 +12,15 @@ from processing.sensor.rectification import Rectification
 from processing.sensor.view import Crop, ViewConfig
 from processing.sensor.view_store import ViewStore
 from processing.track.beam import Hypothesis, Scene
-from processing.track.hypotheses import HypothesisConfig, TrajectoryHypothesis, _unsure_of_azimuths
+from processing.track.hypotheses import (
+    HypothesisConfig,
+    TrajectoryHypothesis,
+    _unsure_of_azimuths,
+    with_azimuths_sought,
+)
 from processing.track.joint_refinement import Motion, Refined
 from processing.track.revolution import profile_kernels as rk
-from processing.track.revolution.axis import Axis
+from processing.track.revolution.axis import Axis, angles_between
 from processing.track.revolution.azimuth import AzimuthConfig, given_azimuths
 from processing.track.revolution.profile import BodyConfig, RoundBody, anchored, is_round, laid_on_profile
 from recordings.geometry import CameraModel, rotation_exp
@@ -36,8 +41,8 @@ def can_poses() -> np.ndarray:
     return np.array(out)
 
 
-def can(poses: np.ndarray) -> ViewStore:
-    """What the camera sees of it, without noise: mask by the rays that hit, samples of what faces the camera."""
+def can(poses: np.ndarray, printed: bool = False) -> ViewStore:
+    """What the camera sees of it, without noise: mask and colours by the rays that hit, samples of what faces it."""
     rectified = Rectification.of(CAMERA)
     crops, views = [], []
     for n, pose in enumerate(poses):
@@ -49,7 +54,9 @@ def can(poses: np.ndarray) -> ViewStore:
         hit = np.isfinite(z)
         depth = np.where(hit, z, 0).reshape(120, 120).astype(np.float32)
         mask = hit.reshape(120, 120)
-        crops.append(Crop(n, corner, mask, depth, np.zeros((120, 120, 3), np.float32), np.zeros_like(mask), None, 0.0))
+        surface = (rays * np.where(hit, z, 0.0).reshape(120, 120, 1) - pose[:3, 3]) @ pose[:3, :3]
+        color = print_at(surface) if printed else np.zeros((120, 120, 3), np.float32)
+        crops.append(Crop(n, corner, mask, depth, color, np.zeros_like(mask), None, 0.0))
         inside = np.flatnonzero(hit)
         chosen = np.random.default_rng(n).permutation(inside)[:500]
         views.append((rays.reshape(-1, 3)[chosen] * z[chosen, None], normal[chosen]))
@@ -61,6 +68,13 @@ def can(poses: np.ndarray) -> ViewStore:
         offset = int(store.table[n, lay.OFFSET])
         store.maps[offset : offset + 120 * 120, lay.Z] = crops[n].depth_m.ravel()
     return store
+
+
+def print_at(surface_m: np.ndarray) -> np.ndarray:
+    """Patches of 20 degrees and 20 mm in colours of their own."""
+    colors = np.random.default_rng(7).uniform(0.2, 0.8, (18, 5, 3)).astype(np.float32)
+    around = np.floor((np.arctan2(surface_m[..., 1], surface_m[..., 0]) / (2 * np.pi) + 0.5) * 18).astype(int)
+    return colors[around % 18, np.clip((surface_m[..., 2] + HALF_M) / 0.02, 0, 4).astype(int)]
 
 
 def seen(rays: np.ndarray, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -161,6 +175,21 @@ def test_given_azimuths_of_a_can_that_nothing_marks_stay_and_grow_uncertain() ->
     assert sigma_deg[0] == 0
     assert (np.diff(sigma_deg) > 0).all()
     assert sigma_deg[-1] > 10
+
+
+def test_azimuths_that_slid_come_back_to_the_print_and_right_ones_stay() -> None:
+    true = can_poses()
+    store, n = can(true, printed=True), len(true)
+    assert all(store.fill(i) for i in range(n))
+    scene = Scene(store, np.arange(n) / 30, np.zeros(3), np.zeros(3), Sift())
+    slid_deg = np.array([0.0, 0.0, 0.0, 60.0, 75.0, 75.0, -130.0, -130.0])
+    slid = np.array([pose @ AXIS.rotation(float(np.radians(a))) for pose, a in zip(true, slid_deg)])
+    for poses, most_deg in ((slid, 3.0), (true, 0.0)):
+        found, axis = with_azimuths_sought(scene, poses, np.ones(n, dtype=bool), HypothesisConfig())
+        assert axis is not None
+        assert np.abs(np.degrees(angles_between(found, true, axis))).max() <= most_deg
+        between = np.linalg.inv(found) @ poses  # they turn about the axis
+        np.testing.assert_allclose(between[:, :3, :3] @ axis.direction, np.tile(axis.direction, (n, 1)), atol=1e-9)
 
 
 def test_an_anchored_view_keeps_its_pose_and_the_axis_its_place_in_space() -> None:
