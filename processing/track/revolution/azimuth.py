@@ -166,7 +166,7 @@ def estimate_azimuths(
         by_print = _sought(_near(appearance, nothing), rest, [*starts, by_print], config)
         correlations = seen.best_correlations(_between(by_print, frames, config))
     trust = _trust(seen, by_print, (shape, by_shape), frames, config)
-    costs = _told(seen, shape, trust)
+    costs = _pair_costs(seen, shape, trust)
     state = _sought(costs, rest, [*starts, by_print, by_shape], config)
     better = tk.energy(starts[0], costs, *rest) - tk.energy(state, costs, *rest) > 0.5 * len(state)
     state = state if better else starts[0]
@@ -186,7 +186,7 @@ def given_azimuths(
     seen, shape, standing, rest = _weighed(scene, poses, frames, axis, config)
     state = np.zeros(len(frames.views), dtype=np.int64)
     trust = _trust(seen, state, (shape, state), frames, config)
-    spread = _azimuth_sigma_rad(frames, _told(seen, shape, trust), rest, state, len(poses))
+    spread = _azimuth_sigma_rad(frames, _pair_costs(seen, shape, trust), rest, state, len(poses))
     return Azimuths(poses, spread, axis, replace(trust, shape=standing * trust.shape))
 
 
@@ -242,7 +242,7 @@ def _trust(
     return Trust(min(_expected(frames) / left[0], 1.0) * usual[0], usual[1], tuple(correlations.tolist()))
 
 
-def _told(seen: PrintMatch, shape: Float[Array, "m c"], trust: Trust) -> Float[Array, "m c"]:
+def _pair_costs(seen: PrintMatch, shape: Float[Array, "m c"], trust: Trust) -> Float[Array, "m c"]:
     """What pairs cost as far as either is trusted."""
     return _near(trust.appearance * seen.costs(np.array(trust.correlations)), trust.shape * shape)
 
