@@ -14,6 +14,8 @@ from numba import njit
 
 RAMPS = (2, 3, 4, 6, 8, 12, 18, 27)
 """Over so many views a rotation may grow."""
+OPEN_RAD = 1e6
+"""A turn whose standard deviation is beyond this is not expected at all."""
 
 
 @no_type_check
@@ -59,9 +61,10 @@ def spin_cost(state, base, steps_s, still, spin_weight, usual, expected, slack, 
             break
         turn = base[t] - (state[t + 1] - state[t]) * step
         turn -= 2.0 * np.pi * np.floor(turn / (2.0 * np.pi) + 0.5)
-        off = turn - expected[t]
-        off -= 2.0 * np.pi * np.floor(off / (2.0 * np.pi) + 0.5)
-        total += np.log(1.0 + (off / slack[t]) ** 2)
+        if slack[t] < OPEN_RAD:
+            off = turn - expected[t]
+            off -= 2.0 * np.pi * np.floor(off / (2.0 * np.pi) + 0.5)
+            total += np.log(1.0 + (off / slack[t]) ** 2)
         rate = turn / steps_s[t]
         if known:
             total += spin_weight[t] * np.log(1.0 + ((rate - last) / usual[t]) ** 2)
@@ -82,6 +85,23 @@ def energy(state, costs, pairs, base, steps_s, still, spin_weight, usual, expect
 
 @no_type_check
 @njit(cache=True, nogil=True, fastmath=True)
+def _add_turned(out, costs, between, forward):
+    """Adds to out (cells) what a pair costs with so many cells between its views, and from there on or back."""
+    cells = len(costs)
+    if forward:
+        for q in range(cells - between):
+            out[q] += costs[between + q]
+        for q in range(between):
+            out[cells - between + q] += costs[q]
+    else:
+        for q in range(between + 1):
+            out[q] += costs[between - q]
+        for q in range(between + 1, cells):
+            out[q] += costs[cells + between - q]
+
+
+@no_type_check
+@njit(cache=True, nogil=True, fastmath=True)
 def _part(state, a, b, costs, pairs, out):
     """Into out (cells): what the pairs with one view in a..b cost when those views turn together."""
     cells = costs.shape[1]
@@ -91,40 +111,73 @@ def _part(state, a, b, costs, pairs, out):
         one, two = a <= i <= b, a <= j <= b
         if one == two:
             continue
-        between = (state[i] - state[j]) % cells
-        for q in range(cells):
-            out[q] += costs[m, (between + q if one else between - q) % cells]
+        _add_turned(out, costs[m], (state[i] - state[j]) % cells, one)
 
 
 @no_type_check
 @njit(cache=True, nogil=True, fastmath=True)
-def _ramp(state, a, length, q, cells, trial, b):
-    """`trial`: the views from a on turned, over `length` of them more and more, by q; views up to b."""
-    turn = q if q <= cells // 2 else q - cells
-    for t in range(a, b + 1):
-        trial[t] = (state[t] + int(np.round(turn * min((t - a + 1.0) / length, 1.0)))) % cells
-
-
-@no_type_check
-@njit(cache=True, nogil=True, fastmath=True)
-def _ramp_costs(state, a, length, costs, pairs, rest, out, trial):
-    """Into out (cells): what the pairs and the changes of spin that a ramp changes cost, by how far it turns."""
+def _run_costs(state, a, b, costs, pairs, rest, out, trial):
+    """Into out (cells): what the pairs and the changes of spin cost when the views a..b turn together, by how far; the
+    spin within them stays, so that it counts near a and near b alone."""
     base, steps_s, still, spin_weight, usual, expected, slack, step, motion = rest
     v, cells = len(state), costs.shape[1]
+    _part(state, a, b, costs, pairs, out)
+    lo, hi = max(a - 2, 0), min(b + 2, v - 1)
+    apart, last = b - a > 4, b - 2
+    first = min(a + 2 if apart or b == v - 1 else hi, hi)
+    trial[lo : hi + 1] = state[lo : hi + 1]
+    for q in range(cells):
+        trial[a : min(b, first) + 1] = (state[a : min(b, first) + 1] + q) % cells
+        out[q] += spin_cost(trial, base, steps_s, still, spin_weight, usual, expected, slack, step, motion, lo, first)
+        if apart and b < v - 1:
+            trial[last : b + 1] = (state[last : b + 1] + q) % cells
+            out[q] += spin_cost(
+                trial, base, steps_s, still, spin_weight, usual, expected, slack, step, motion, last, hi
+            )
+
+
+@no_type_check
+@njit(cache=True, nogil=True, fastmath=True)
+def _ramp(length, cells):
+    """Cells that a view turns by, (length + 1, cells): after so many views of a ramp, by how far it turns in all."""
+    out = np.zeros((length + 1, cells), np.int64)
+    for k in range(length + 1):
+        for q in range(cells):
+            out[k, q] = int(np.round((q if q <= cells // 2 else q - cells) * (k / length)))
+    return out
+
+
+@no_type_check
+@njit(cache=True, nogil=True, fastmath=True)
+def _ramped(state, a, ramp, q, trial, b):
+    """`trial`: the views from a on turned along a ramp; views up to b."""
+    for t in range(a, b + 1):
+        trial[t] = (state[t] + ramp[min(t - a + 1, len(ramp) - 1), q]) % ramp.shape[1]
+
+
+@no_type_check
+@njit(cache=True, nogil=True, fastmath=True)
+def _ramp_costs(state, a, ramp, costs, pairs, rest, out, trial):
+    """Into out (cells): what the pairs and the changes of spin that a ramp changes cost, by how far it turns."""
+    base, steps_s, still, spin_weight, usual, expected, slack, step, motion = rest
+    v, cells, length = len(state), costs.shape[1], len(ramp) - 1
     out[:] = 0.0
     for m in range(pairs.shape[0]):
         i, j = pairs[m, 0], pairs[m, 1]
-        one, two = min(max((i - a + 1.0) / length, 0.0), 1.0), min(max((j - a + 1.0) / length, 0.0), 1.0)
+        one, two = min(max(i - a + 1, 0), length), min(max(j - a + 1, 0), length)
         if one == two:
             continue
-        between = state[i] - state[j]
+        between = (state[i] - state[j]) % cells
+        if abs(one - two) == length:
+            _add_turned(out, costs[m], between, one > two)
+            continue
         for q in range(cells):
-            turn = q if q <= cells // 2 else q - cells
-            out[q] += costs[m, (between + int(np.round(turn * one)) - int(np.round(turn * two))) % cells]
+            at = between + ramp[one, q] - ramp[two, q]
+            out[q] += costs[m, at + cells if at < 0 else (at - cells if at >= cells else at)]
     lo, hi = max(a - 2, 0), min(a + length + 1, v - 1)
     trial[lo : hi + 1] = state[lo : hi + 1]
     for q in range(cells):
-        _ramp(state, a, length, q, cells, trial, hi)
+        _ramped(state, a, ramp, q, trial, hi)
         out[q] += spin_cost(trial, base, steps_s, still, spin_weight, usual, expected, slack, step, motion, lo, hi)
 
 
@@ -144,27 +197,22 @@ def descend(
                 b = v - 1 if length == 0 else a + length - 1
                 if b >= v or (length > 0 and b == v - 1) or (length > 4 and length % 4 > 0):
                     continue
-                _part(state, a, b, costs, pairs, out)
-                lo, hi = max(a - 2, 0), min(a + 2 if length == 0 else b + 2, v - 1)
-                trial[lo : hi + 1] = state[lo : hi + 1]
-                best, least = 0, 0.0
-                for q in range(cells):
-                    trial[a : min(b, hi) + 1] = (state[a : min(b, hi) + 1] + q) % cells
-                    e = out[q] + spin_cost(
-                        trial, base, steps_s, still, spin_weight, usual, expected, slack, step, motion, lo, hi
-                    )
-                    if q == 0 or e < least - 1e-9:
-                        best, least = q, e
+                _run_costs(state, a, b, costs, pairs, rest, out, trial)
+                best = 0
+                for q in range(1, cells):
+                    if out[q] < out[best] - 1e-9:
+                        best = q
                 if best:
                     state[a : b + 1] = (state[a : b + 1] + best) % cells
                     changed = True
         for length in RAMPS:
+            ramp = _ramp(length, cells)
             for a in range(1, v - 1):
-                _ramp_costs(state, a, length, costs, pairs, rest, out, trial)
+                _ramp_costs(state, a, ramp, costs, pairs, rest, out, trial)
                 best = out.argmin()
                 if out[best] < out[0] - 1e-6:
                     trial[:] = state
-                    _ramp(state, a, length, best, cells, trial, v - 1)
+                    _ramped(state, a, ramp, best, trial, v - 1)
                     state[:] = trial
                     changed = True
         if not changed:
@@ -202,25 +250,19 @@ def variances(state, costs, pairs, base, steps_s, still, spin_weight, usual, exp
     """Variance (rad^2) of each view's azimuth against view 0: the widest of the moves that turn it, each with the
     probability that its energy leaves it."""
     v, cells = len(state), costs.shape[1]
-    out, trial, e, var = np.zeros(cells), state.copy(), np.zeros(cells), np.zeros(v)
+    trial, e, var = state.copy(), np.zeros(cells), np.zeros(v)
     rest = base, steps_s, still, spin_weight, usual, expected, slack, step, motion
     for length in range(v):
         for a in range(1, v):
             b = v - 1 if length == 0 else a + length - 1
             if b >= v:
                 continue
-            _part(state, a, b, costs, pairs, out)
-            lo, hi = max(a - 2, 0), min(a + 2 if length == 0 else b + 2, v - 1)
-            trial[lo : hi + 1] = state[lo : hi + 1]
-            for q in range(cells):
-                trial[a : min(b, hi) + 1] = (state[a : min(b, hi) + 1] + q) % cells
-                e[q] = out[q] + spin_cost(
-                    trial, base, steps_s, still, spin_weight, usual, expected, slack, step, motion, lo, hi
-                )
+            _run_costs(state, a, b, costs, pairs, rest, e, trial)
             _widen(var, e, a, b, 1, step)
     for length in RAMPS:
+        ramp = _ramp(length, cells)
         for a in range(1, v - 1):
-            _ramp_costs(state, a, length, costs, pairs, rest, e, trial)
+            _ramp_costs(state, a, ramp, costs, pairs, rest, e, trial)
             _widen(var, e, a, v - 1, length, step)
     return var
 
