@@ -163,10 +163,14 @@ def chosen(run: Run, before: Done, known: TrackResult, shape: Done, images: Imag
     return found["anew" if anew.surely_better(stays) else best]
 
 
-def sure_alone(run: Run, images: Images, alone: Done[TrackResult], anew: Done[TrackResult]) -> bool:
-    """Whether a toss's own track fits its frames far better than the object located on a shape: by `FAR_BETTER`."""
+def joins(
+    run: Run, images: Images, alone: Done[TrackResult], anew: Done[TrackResult], explained: Callable[[], bool]
+) -> bool:
+    """Whether a toss comes to the others by the object located on their shape (`anew`): where its frames surely agree
+    better with each other so than by its own track; or where that shape has `explained` them, and they do not fit far
+    better (`FAR_BETTER`) by its own."""
     own, there = (TrackResiduals(on_itself(run, done, images), done.result.cost) for done in (alone, anew))
-    return own.surely_better(there, FAR_BETTER)
+    return there.surely_better(own) or (not own.surely_better(there, FAR_BETTER) and explained())
 
 
 @dataclass(frozen=True, eq=False)

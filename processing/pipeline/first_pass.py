@@ -12,7 +12,7 @@ import numpy as np
 
 from processing.images import Images
 from processing.pipeline import notices as say
-from processing.pipeline.cross_fit import cross_fitted, fused, located_on, sure_alone, with_free_surface
+from processing.pipeline.cross_fit import cross_fitted, fused, joins, located_on, with_free_surface
 from processing.pipeline.passes import Pass
 from processing.run import Run, each
 from processing.stages.field import learn_field
@@ -65,17 +65,19 @@ def located(
     run: Run, images: Mapping[int, Images], joined: Mapping[int, Done], missing: Mapping[int, Done]
 ) -> dict[int, Done]:
     """Of tosses that are not among the `joined` ones (`missing`: their own tracks, which would stay), those whose
-    object is found on the shape of these, by tracking it there from the start, and is explained by it; none of them
-    that surely fits better alone."""
+    object is found on the shape of these, by tracking it there from the start."""
     if not missing:
         return {}
     shape = fused(run, joined, images)
     if shape is None:  # they are no surer of it
         return {}
     tracks = {t: done for t, done in each(run, missing, lambda t: located_on(run, images[t], shape)).items() if done}
-    explained = {t: done for t, done in tracks.items() if not _unexplained(run, done, shape, images, [t])}
-    better = each(run, explained, lambda t: sure_alone(run, images[t], missing[t], explained[t]))
-    return {t: done for t, done in explained.items() if not better[t]}
+
+    def explained(toss: int) -> bool:
+        return not _unexplained(run, tracks[toss], shape, images, [toss])
+
+    found = each(run, tracks, lambda t: joins(run, images[t], missing[t], tracks[t], lambda: explained(t)))
+    return {t: done for t, done in tracks.items() if found[t]}
 
 
 def own_shape(run: Run, toss: int, alone: Done, images: Mapping[int, Images]) -> Done | None:
@@ -106,17 +108,25 @@ def kept_apart(
     shape that is not common to both, against `CycleConfig.apart_mask`; and it must be `APART` times what the toss's own
     frames fused alone leave (a pixel of a small mask is much, a gripper hides some).
 
-    Where the shape of all explains all, there are none. Else tosses are added one by one to the first, each kept only
-    where the frames fused so far explain every toss among them.
+    Where the shape of all explains all, there are none. Else tosses are grouped, each added to the one that its own
+    frames explain best where the frames fused so far explain every toss among them, what is left likewise; the largest
+    group stays (of two as large, the one that starts with the toss that its own frames explain better).
     """
     if not _unexplained(run, together, shape, images, joined):
         return ()
-    kept: list[int] = list(joined[:1])
-    for toss in joined[1:]:
-        tried = [*kept, toss]
-        shown = fused(run, dict.fromkeys(tried, together), images)
-        if shown is None or not _unexplained(run, together, shown, images, tried):
-            kept = tried
+    alone = _left_alone(run, together, images, joined)
+    left = sorted(joined, key=lambda t: alone.get(t, np.inf))
+    groups: list[list[int]] = []
+    while left:
+        group = left[:1]
+        for toss in left[1:]:
+            tried = [*group, toss]
+            shown = fused(run, dict.fromkeys(tried, together), images)
+            if shown is None or not _unexplained(run, together, shown, images, tried):
+                group = tried
+        groups.append(group)
+        left = [t for t in left if t not in group]
+    kept = max(groups, key=len)
     return tuple(t for t in joined if t not in kept)
 
 
@@ -130,10 +140,15 @@ def _unexplained(
     unexplained = [t for t in tosses if left[t] > limit]
     if not unexplained:
         return []
-    found = each(run, unexplained, lambda t: fused(run, {t: together}, images))
-    own = {t: shape for t, shape in found.items() if shape is not None}
-    alone = _left(run, together, own, images) if own else {}
+    alone = _left_alone(run, together, images, unexplained)
     return [t for t in alone if left[t] > APART * alone[t]]
+
+
+def _left_alone(run: Run, together: Done, images: Mapping[int, Images], tosses: Sequence[int]) -> dict[int, float]:
+    """What each toss's own frames, fused alone, leave of its outline (`_left`); none of those that show no shape."""
+    found = each(run, tosses, lambda t: fused(run, {t: together}, images))
+    own = {t: shape for t, shape in found.items() if shape is not None}
+    return _left(run, together, own, images) if own else {}
 
 
 def _left(run: Run, together: Done, shapes: Mapping[int, Done], images: Mapping[int, Images]) -> dict[int, float]:

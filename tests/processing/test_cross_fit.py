@@ -352,19 +352,27 @@ def test_a_toss_that_surely_fits_better_alone_is_not_located_on_the_others(
 ) -> None:
     tosses = Tosses(tiny_world, tmp_path, 2)
     joined, own = {0: tosses.track(0, 0 * TURN, "track-0")}, {1: tosses.track(1, 0 * TURN, "alone-1")}
-    monkeypatch.setattr(first_pass, "sure_alone", lambda *_: True)
+    monkeypatch.setattr(first_pass, "joins", lambda *_: False)
     assert first_pass.located(tosses.run, tosses.images, joined, own) == {}
 
 
-@pytest.mark.parametrize(("anew_mm", "anew_cost", "sure"), [(2.2, 0.1, False), (1.8, 0.25, True), (4.5, 0.1, True)])
-def test_a_track_alone_that_fits_far_better_is_kept(
-    anew_mm: float, anew_cost: float, sure: bool, monkeypatch: pytest.MonkeyPatch, tiny_world: Any, tmp_path: Path
-) -> None:
+@pytest.mark.parametrize(
+    ("anew_mm", "anew_cost", "explained", "comes"),
+    [
+        (2.2, 0.1, True, True), (2.2, 0.1, False, False), (1.8, 0.25, True, False), (4.5, 0.1, True, False),
+        (0.8, 0.1, False, True),
+    ],
+)  # fmt: skip
+def test_a_track_alone_that_fits_far_better_is_kept_and_one_that_fits_worse_is_not(
+    anew_mm: float, anew_cost: float, explained: bool, comes: bool, monkeypatch: pytest.MonkeyPatch, tiny_world: Any,
+    tmp_path: Path,
+) -> None:  # fmt: skip
+    """A shape whose tosses have not seen all sides does not explain what shows the others, however right it lies."""
     tosses, depth_mm = Tosses(tiny_world, tmp_path, 1), {"alone": 2.0, "anew": anew_mm}
     monkeypatch.setattr(cross_fit, "on_itself", lambda _, done, __: seen(depth_mm[done.key]))
     alone = Done(tmp_path, "alone", OPEN, False)
     anew = Done(tmp_path, "anew", replace(OPEN, cost=anew_cost), False)
-    assert cross_fit.sure_alone(tosses.run, tosses.images[0], alone, anew) == sure
+    assert cross_fit.joins(tosses.run, tosses.images[0], alone, anew, lambda: explained) == comes
 
 
 def test_tosses_that_show_nothing_sure_correct_no_other(tiny_world: Any, tmp_path: Path) -> None:
